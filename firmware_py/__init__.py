@@ -1,0 +1,1 @@
+"""The controller as it sits in the car: CAN frames in, CAN frames out, every 10 ms."""
