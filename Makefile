@@ -1,0 +1,61 @@
+# make demo, make test: both set up everything they need, from a clean checkout.
+# Another interpreter: make install PYTHON=/path/to/python3.12 (any Python >= 3.11).
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help install demo test quick live design clean
+
+VENV := .venv
+STAMP := $(VENV)/.installed
+BIN := $(VENV)/bin
+TEST_WORKERS ?= 2
+
+help:
+	@echo "make demo     the car takes the test by itself, forward and in reverse (about 40 s); more: .venv/bin/parkctl demo --help"
+	@echo "make test     lint, format, types, all tests"
+	@echo "make design   makes the shipped tables anew from the vehicle and course files"
+	@echo "make install  .venv with everything in it (demo and test do this by themselves)"
+	@echo "make clean    removes .venv and what the tools cached"
+
+install: $(STAMP)
+
+# The first interpreter that is new enough; candidates are tried by running them (a shim may exist and not work).
+# A .venv that works is brought up to date, a half-made one is made anew; the stamp is written last.
+$(STAMP): pyproject.toml constraints.txt
+	@if $(BIN)/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then exit 0; fi; \
+	python=; \
+	for candidate in $(or $(PYTHON),python3 python3.13 python3.12 python3.11); do \
+	  if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	  echo "make: error: no Python >= 3.11 found (tried: $(or $(PYTHON),python3 python3.13 python3.12 python3.11));" \
+	    "install one, or name it: make install PYTHON=/path/to/python3.11" >&2; exit 1; \
+	fi; \
+	"$$python" -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "make: error: $$python cannot make virtual environments; on Debian and Ubuntu install python3-venv" >&2; exit 1; }; \
+	echo "setting up $(VENV) with $$("$$python" --version) (once; takes about a minute)"; \
+	"$$python" -m venv --clear $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[tools,test]' -c constraints.txt
+	@touch $@
+
+demo: $(STAMP)
+	@$(BIN)/parkctl demo
+
+design: $(STAMP)
+	@$(BIN)/parkctl design --update
+
+test: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(MAKE) --no-print-directory quick live
+
+quick: $(STAMP)
+	$(BIN)/pytest -n $(TEST_WORKERS) -m "not live"
+
+# Real processes in wall-clock time: one at a time, or they would disturb each other.
+live: $(STAMP)
+	$(BIN)/pytest -m live
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks *.egg-info
