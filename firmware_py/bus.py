@@ -1,0 +1,109 @@
+"""The CAN bus as the cycle sees it: drain all that has come, send what is due; no thread, no waiting, no exception."""
+
+import contextlib
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from firmware_py.errors import UserError
+
+if TYPE_CHECKING:
+    from can import BusABC
+
+DEFAULT_INTERFACE = "loopbus"
+FRAMES_PER_DRAIN = 256
+"""Bound of one drain: a flooded bus costs the cycle a bounded time; the rest waits for the next cycle."""
+
+Frame = tuple[int, bytes]
+
+
+class Bus:
+    """One open interface. All counts are since start.
+
+    `error_frames`: error frames received. `foreign`: frames of a kind that the DBC does not know (29-bit id, remote,
+    CAN FD). `drains_cut`: drains that ended at their bound. `receive_failed`, `send_failed`: calls that the driver
+    refused (bus off, interface down, full queue); to the cycle they are silence, which its timeouts judge.
+    """
+
+    def __init__(self, bus: "BusABC") -> None:
+        from can import CanError, Message  # noqa: PLC0415 -- heavy; see open_bus
+
+        self._bus = bus
+        self._message = Message
+        self._driver_errors = (CanError, OSError)
+        self.error_frames = 0
+        self.foreign = 0
+        self.drains_cut = 0
+        self.receive_failed = 0
+        self.send_failed = 0
+
+    @property
+    def description(self) -> str:
+        """What the driver says it is connected to."""
+        return str(self._bus.channel_info)
+
+    def drain(self) -> list[Frame]:
+        """Return all frames that wait, oldest first, at most FRAMES_PER_DRAIN."""
+        frames: list[Frame] = []
+        for _ in range(FRAMES_PER_DRAIN):
+            try:
+                message = self._bus.recv(0)
+            except self._driver_errors:
+                self.receive_failed += 1
+                return frames
+            if message is None:
+                return frames
+            if message.is_error_frame:
+                self.error_frames += 1
+            elif message.is_extended_id or message.is_remote_frame or message.is_fd:
+                self.foreign += 1
+            else:
+                frames.append((message.arbitration_id, bytes(message.data)))
+        self.drains_cut += 1
+        return frames
+
+    def send(self, frames: Iterable[Frame]) -> int:
+        """Send the frames in their order; return how many of them the driver refused."""
+        failed = 0
+        for arbitration_id, data in frames:
+            try:
+                self._bus.send(self._message(arbitration_id=arbitration_id, data=data, is_extended_id=False))
+            except self._driver_errors:
+                failed += 1
+        self.send_failed += failed
+        return failed
+
+    def close(self) -> None:
+        """Give the interface back."""
+        with contextlib.suppress(*self._driver_errors):
+            self._bus.shutdown()
+
+
+def open_bus(
+    interface: str | None = None, channel: str | None = None, bitrate: int | None = None, *, use_config: bool = True
+) -> Bus:
+    """Open the bus that the options name, in python-can's terms.
+
+    What is None comes from python-can's own configuration (CAN_* variables, can.conf) where `use_config` allows it;
+    without any of it the embedded bus is opened. Raises UserError.
+    """
+    import can  # noqa: PLC0415 -- heavy, and the tests of everything else do without it
+
+    options: dict[str, object] = {"interface": interface, "channel": channel, "bitrate": bitrate}
+    options = {key: value for key, value in options.items() if value is not None}
+    try:
+        if use_config:
+            options = {key: value for key, value in can.util.load_config(config=options).items() if value is not None}
+        options.setdefault("interface", DEFAULT_INTERFACE)
+        if options["interface"] != DEFAULT_INTERFACE and "channel" not in options:
+            # python-can would take its driver's default, which for socketcan is the physical can0.
+            raise UserError(f"--channel: interface {options['interface']} needs one, e.g. --channel vcan0")
+        # No filters: python-can's recv(0) ends at a frame that its software filter drops, with more frames waiting.
+        return Bus(can.Bus(ignore_config=True, **options))  # type: ignore[arg-type]
+    except (can.CanError, OSError, ImportError, ValueError, TypeError, AttributeError) as error:
+        # Drivers raise all of these for an interface that is not there or options that they do not know.
+        name = f"{options.get('interface', DEFAULT_INTERFACE)} {options.get('channel', '')}".strip()
+        raise UserError(f"CAN interface {name}: cannot be opened ({_one_line(error)})") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
