@@ -7,8 +7,8 @@ to the others, as one Linux `struct can_frame` a datagram. The kernel holds what
 buffer's size, and drops what comes then. A node that dies is silence; one that starts on its port is heard at once.
 
 A datagram to a closed port costs twice one to an open port, so a node stops sending to a port whose closing the kernel
-reports, sends one datagram there now and then to see whether it has opened, and resumes at once when anything comes
-from it: every node says hello (an empty datagram) when it opens.
+reports, and resumes when anything comes from it: every node says hello (an empty datagram) when it opens. For the case
+that a hello waits behind frames that nobody reads, one datagram is sent to a closed port now and then.
 """
 
 import errno
@@ -80,7 +80,10 @@ class LoopBus(can.BusABC):
         self._send_to_all(_FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data)))
 
     def _send_to_all(self, datagram: bytes) -> None:
-        probe = self._port_to_probe() if len(self._open) < len(self._targets) else None
+        probe = None
+        if len(self._open) < len(self._targets):
+            self._notice_newcomers()
+            probe = self._port_to_probe()
         for port in self._targets:
             if port in self._open or port == probe:
                 self._send_to(port, datagram)
@@ -94,6 +97,20 @@ class LoopBus(can.BusABC):
                 self._forget_closed_ports()
             except OSError as error:
                 raise can.CanOperationError(f"loopbus: cannot send: {error.strerror}", error.errno) from error
+
+    def _notice_newcomers(self) -> None:
+        """Read the hellos before the first frame that waits, for a node that sends without receiving."""
+        for _ in range(_MAX_DATAGRAMS):
+            try:
+                if self._socket.recv(1, socket.MSG_PEEK):
+                    return
+                datagram, ancillary, _flags, address = self._socket.recvmsg(0)
+            except ConnectionRefusedError:
+                self._forget_closed_ports()
+            except OSError:  # nothing waits; anything worse shows when sending
+                return
+            else:
+                self._to_message(datagram, ancillary, address)
 
     def _port_to_probe(self) -> int | None:
         now_s = time.monotonic()
@@ -198,8 +215,8 @@ def _bind_first_free(ports: range) -> socket.socket:
                 if error.errno != errno.EADDRINUSE:
                     raise can.CanInitializationError(f"loopbus: port {port}: {error.strerror}", error.errno) from error
         raise can.CanInitializationError(
-            f"loopbus: all UDP ports {ports[0]} to {ports[-1]} of {HOST} are taken; end what holds them or name another "
-            f"channel, e.g. {ports[0] + 100}"
+            f"loopbus: all UDP ports {ports[0]} to {ports[-1]} of {HOST} are taken; end what holds them or give "
+            f"another channel, e.g. {ports[0] + 100}"
         )
     except BaseException:
         node.close()
