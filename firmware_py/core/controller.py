@@ -1,0 +1,350 @@
+"""One control cycle, from reports to commands: the straight line of the whole controller.
+
+    health -> supervisor -> manoeuvre -> observer (path) -> schedule -> feedforward + PID -> limits -> speed -> gate
+
+Pure: `step(tables, state, inputs) -> (state, outputs)`. Nothing here reads a clock, a bus or a file.
+"""
+
+import math
+from typing import NamedTuple
+
+from firmware_py.core import conditions as c
+from firmware_py.core import gate as last_gate
+from firmware_py.core import health, limits, manoeuvre, observer, pid, predictor, speed, supervisor
+from firmware_py.core.motion import PathState
+from firmware_py.core.path import PathPoint, locate, pose_error
+from firmware_py.core.schedule import Gains, gains_at
+from firmware_py.core.signals import (
+    GEAR_NONE,
+    GEAR_PARK,
+    LEG_COMPLETE,
+    LEG_IDLE,
+    MODE_ACTIVE,
+    MODE_FAULT,
+    MODE_MANUAL,
+    MODE_READY,
+    Inputs,
+    LongCommand,
+    Outputs,
+    SteerCommand,
+    SysCommand,
+    Track,
+)
+from firmware_py.core.tables import CarTable, LegTable, Tables
+
+PERIOD_US = 10_000
+PERIOD_S = 0.01
+
+REPORT_AGE_S = 0.003
+"""How long before the cycle the reports of a cycle are sampled, as agreed for the bus; the law works at any phase."""
+
+LONGEST_CYCLE_S = 0.1
+"""After a longer pause the odometry is not integrated further: the vehicle's watchdog has stopped the car by then."""
+
+
+class State(NamedTuple):
+    """All that one cycle hands to the next. `sent_angles_rad[0]` is the newest steering command."""
+
+    last_us: int
+    health: health.HealthState
+    supervisor: supervisor.SupervisorState
+    manoeuvre: manoeuvre.ManoeuvreState
+    observer: observer.ObserverState
+    speed: speed.SpeedState
+    integral_m2: float
+    limited: int
+    sent_angles_rad: tuple[float, ...]
+    angle_carry_rad: float
+    speed_sent_mps: float
+    standstill: int
+
+
+def begin() -> State:
+    """Return the state before the first cycle."""
+    return State(
+        last_us=-1,
+        health=health.begin(),
+        supervisor=supervisor.begin(),
+        manoeuvre=manoeuvre.begin(),
+        observer=observer.begin(0.0, 0.0),
+        speed=speed.SpeedState(reference_station_m=0.0, stopping=0),
+        integral_m2=0.0,
+        limited=0,
+        sent_angles_rad=(0.0,) * predictor.QUEUE_LENGTH,
+        angle_carry_rad=0.0,
+        speed_sent_mps=0.0,
+        standstill=0,
+    )
+
+
+def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
+    """Return the next state and the commands of this cycle."""
+    car = tables.car
+    dt_s = _elapsed_s(state.last_us, inputs.now_us)
+
+    # Facts, then the decision.
+    health_state, conditions = health.assess(tables, state.health, inputs, _believed(tables, state), PERIOD_US)
+    if state.manoeuvre.gear_failed != 0:
+        conditions |= 1 << c.DIRECTION_CHANGE_TIMEOUT
+    if manoeuvre.is_done(state.manoeuvre, inputs.long.gear_rpt, inputs.long.park_brake_applied):
+        conditions |= 1 << c.MANOEUVRE_DONE
+    decided = supervisor.decide(state.supervisor, conditions, PERIOD_US)
+    standstill = c.has(conditions, c.STANDSTILL)
+    active = decided.mode == MODE_ACTIVE
+    stopping_on_path = decided.mode == MODE_FAULT
+
+    # The leg, and what changes with it.
+    leg_state = _manoeuvre(state, car, inputs, decided.mode, standstill)
+    direction = manoeuvre.direction_of(leg_state.leg)
+    leg = tables.leg[direction]
+    observed = state.observer
+    reference = state.speed
+    integral_m2 = state.integral_m2
+    if direction != manoeuvre.direction_of(state.manoeuvre.leg):
+        observed = observer.turn_round(leg, observed)
+        reference = speed.SpeedState(reference_station_m=observed.path.station_m, stopping=0)
+    if not active and not stopping_on_path:
+        reference = speed.SpeedState(reference_station_m=observed.path.station_m, stopping=0)
+        integral_m2 = 0.0
+
+    # Where the car is, and where it will be when this cycle's command acts.
+    travel_mps = leg.sigma * inputs.motion.speed_meas_mps
+    if standstill:
+        travel_mps = 0.0
+    gains = gains_at(tables.gains, direction, max(travel_mps, 0.0))
+    observed = _observe(
+        tables, leg, gains, observed, state, inputs, health_state.pose_is_new, travel_mps, standstill, dt_s
+    )
+    if not active and not stopping_on_path:
+        observed = _rest_angle(observed, inputs.steer.road_wheel_angle_meas_rad)
+    ahead = predictor.predict(leg, car, observed.path, state.sent_angles_rad, travel_mps, PERIOD_S)
+    if tables.uses_observer == 0:
+        ahead = _as_measured(leg, observed, inputs, ahead.station_m)
+
+    # Steering: feedforward + PID - disturbance, within the limits.
+    at = locate(leg, ahead.station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
+    wanted_rad = _steering(
+        car,
+        at,
+        ahead.cross_track_error_m,
+        ahead.heading_error_rad,
+        ahead.curvature_disturbance_1pm,
+        integral_m2,
+        gains,
+        leg.sigma,
+        travel_mps,
+    )
+    if not active and not stopping_on_path:
+        wanted_rad = inputs.steer.road_wheel_angle_meas_rad
+    limited = limits.limit_angle(car, wanted_rad, state.sent_angles_rad[0], PERIOD_S)
+    preview_m = pid.preview_error_m(ahead.cross_track_error_m, ahead.heading_error_rad, gains.preview_m, leg.sigma)
+    integral_m2 = pid.integrate_m2(integral_m2, preview_m, travel_mps * dt_s, gains, limited.limited)
+
+    # Speed, then the last word.
+    station_now_m = observed.path.station_m + travel_mps * (REPORT_AGE_S + car.pose_latency_samples * PERIOD_S)
+    speed_command = speed.hold()
+    if active and leg_state.driving != 0:
+        reference, speed_command = speed.follow(leg, car, reference, station_now_m, travel_mps, dt_s)
+    passed = last_gate.gate(
+        car,
+        tables.road_wheel_angle_lsb_rad,
+        decided.mode,
+        decided.reaction,
+        standstill,
+        leg.sigma,
+        last_gate.Wanted(
+            angle_rad=limited.angle_rad,
+            travel_speed_mps=speed_command.travel_speed_mps,
+            brake_decel_mps2=speed_command.brake_decel_mps2,
+        ),
+        state.sent_angles_rad[0],
+        state.angle_carry_rad,
+        PERIOD_S,
+    )
+    next_state = State(
+        last_us=inputs.now_us,
+        health=health_state,
+        supervisor=decided,
+        manoeuvre=leg_state,
+        observer=observed,
+        speed=reference,
+        integral_m2=integral_m2,
+        limited=limited.limited,
+        sent_angles_rad=(passed.angle_rad, *state.sent_angles_rad[:-1]),
+        angle_carry_rad=passed.angle_carry_rad,
+        speed_sent_mps=passed.speed_mps,
+        standstill=1 if standstill else 0,
+    )
+    return next_state, _outputs(decided, leg_state, passed, observed, standstill)
+
+
+def _elapsed_s(last_us: int, now_us: int) -> float:
+    """Return the time since the last cycle; one period where there was none."""
+    if last_us < 0:
+        return PERIOD_S
+    return max(min((now_us - last_us) * 1e-6, LONGEST_CYCLE_S), 0.0)
+
+
+def _believed(tables: Tables, state: State) -> health.Believed:
+    path = state.observer.path
+    return health.Believed(
+        mode=state.supervisor.mode,
+        direction_sigma=tables.leg[manoeuvre.direction_of(state.manoeuvre.leg)].sigma,
+        driving=state.manoeuvre.driving,
+        cross_track_error_m=path.cross_track_error_m,
+        heading_error_rad=path.heading_error_rad,
+        station_m=path.station_m,
+        disbelieved=state.observer.disbelieved,
+        averaged=state.observer.averaged,
+        model_angle_rad=path.road_wheel_angle_rad,
+        speed_sent_mps=state.speed_sent_mps,
+    )
+
+
+def _manoeuvre(state: State, car: CarTable, inputs: Inputs, mode: int, standstill: bool) -> manoeuvre.ManoeuvreState:
+    """Return the manoeuvre's next state: it proceeds in Active, is kept in Fault, and is over in Manual and Ready."""
+    if mode == MODE_ACTIVE:
+        steering_gap_rad = inputs.steer.road_wheel_angle_meas_rad - state.sent_angles_rad[0]
+        return manoeuvre.proceed(
+            state.manoeuvre,
+            car,
+            inputs.long.gear_rpt,
+            inputs.long.park_brake_applied,
+            standstill,
+            state.speed.stopping,
+            steering_gap_rad,
+            PERIOD_US,
+        )
+    if mode == MODE_FAULT:
+        kept = state.manoeuvre
+        return manoeuvre.ManoeuvreState(leg=kept.leg, driving=0, waiting_us=0, steering_us=0, gear_failed=0)
+    return manoeuvre.begin()
+
+
+def _observe(
+    tables: Tables,
+    leg: LegTable,
+    gains: Gains,
+    observed: observer.ObserverState,
+    state: State,
+    inputs: Inputs,
+    pose_is_new: int,
+    travel_mps: float,
+    standstill: bool,
+    dt_s: float,
+) -> observer.ObserverState:
+    """Return the observer at the age of the newest pose, predicted by odometry and corrected if a pose arrived."""
+    car = tables.car
+    acted_rad = state.sent_angles_rad[car.pose_latency_samples + car.command_latency_samples]
+    observed = observer.predict_to_pose(leg, car, observed, acted_rad, travel_mps, dt_s)
+    if pose_is_new == 0:
+        return observed
+    error = observer.innovation(
+        leg, observed, inputs.position.position_x_m, inputs.position.position_y_m, inputs.attitude.yaw_rad
+    )
+    if standstill:
+        return observer.correct_standing(observed, error)
+    return observer.correct_moving(observed, gains, error)
+
+
+def _rest_angle(observed: observer.ObserverState, angle_rad: float) -> observer.ObserverState:
+    """Return the observer with the wheels where they are measured: nothing is commanded, so nothing is modelled."""
+    path = observed.path
+    return observer.ObserverState(
+        path=PathState(
+            station_m=path.station_m,
+            cross_track_error_m=path.cross_track_error_m,
+            heading_error_rad=path.heading_error_rad,
+            curvature_disturbance_1pm=path.curvature_disturbance_1pm,
+            road_wheel_angle_rad=angle_rad,
+        ),
+        averaged=observed.averaged,
+        disbelieved=observed.disbelieved,
+    )
+
+
+def _as_measured(leg: LegTable, observed: observer.ObserverState, inputs: Inputs, station_m: float) -> PathState:
+    """Return the state of a law without observer: the errors of the newest pose as it came, no disturbance known."""
+    path = observed.path
+    measured = pose_error(
+        locate(leg, path.station_m),
+        leg.sigma,
+        inputs.position.position_x_m,
+        inputs.position.position_y_m,
+        inputs.attitude.yaw_rad,
+    )
+    return PathState(
+        station_m=station_m,
+        cross_track_error_m=measured.cross_track_error_m,
+        heading_error_rad=measured.heading_error_rad,
+        curvature_disturbance_1pm=0.0,
+        road_wheel_angle_rad=path.road_wheel_angle_rad,
+    )
+
+
+def _steering(
+    car: CarTable,
+    at: PathPoint,
+    cross_track_error_m: float,
+    heading_error_rad: float,
+    disturbance_1pm: float,
+    integral_m2: float,
+    gains: Gains,
+    sigma: float,
+    travel_mps: float,
+) -> float:
+    """Return the wanted road-wheel angle: feedforward, less feedback and disturbance, ahead of the actuator's lag."""
+    reference = car.wheelbase_m * at.feedforward_curvature_1pm
+    feedback_1pm = pid.feedback_1pm(cross_track_error_m, heading_error_rad, integral_m2, gains, sigma)
+    angle_rad = math.atan(reference - car.wheelbase_m * (feedback_1pm + disturbance_1pm))
+    rate_radps = travel_mps * car.wheelbase_m * at.feedforward_slope_1pm2 / (1.0 + reference * reference)
+    return angle_rad + car.steering_lag_s * rate_radps
+
+
+def _outputs(
+    decided: supervisor.SupervisorState,
+    leg_state: manoeuvre.ManoeuvreState,
+    passed: last_gate.Passed,
+    observed: observer.ObserverState,
+    standstill: bool,
+) -> Outputs:
+    """Return the frames' values. In Fault the vehicle stays enabled until it stands, to steer while braking."""
+    enable = 0
+    if (decided.mode == MODE_READY and decided.enabling != 0) or passed.follow != 0:
+        enable = 1
+    clear = 0
+    if decided.mode == MODE_MANUAL and decided.clearing_us > 0:
+        clear = 1
+    leg = leg_state.leg
+    if leg == LEG_IDLE and decided.reason == c.COMPLETE:
+        leg = LEG_COMPLETE
+    gear = GEAR_NONE
+    if decided.mode == MODE_ACTIVE:
+        gear = manoeuvre.gear_of(leg_state.leg)
+    park_brake = 0
+    if (passed.follow == 0 and standstill) or gear == GEAR_PARK:
+        park_brake = 1
+    path = observed.path
+    return Outputs(
+        sys=SysCommand(
+            enable_request=enable,
+            clear_request=clear,
+            control_mode=decided.mode,
+            control_leg=leg,
+            control_reason=decided.reason,
+        ),
+        steer=SteerCommand(road_wheel_angle_cmd_rad=passed.angle_rad, steer_enable=passed.follow),
+        long=LongCommand(
+            speed_cmd_mps=passed.speed_mps,
+            brake_decel_cmd_mps2=passed.brake_decel_mps2,
+            gear_cmd=gear,
+            park_brake_cmd=park_brake,
+            long_enable=passed.follow,
+        ),
+        track=Track(
+            station_m=max(path.station_m, 0.0),
+            cross_track_error_est_m=path.cross_track_error_m,
+            heading_error_est_rad=path.heading_error_rad,
+            curvature_disturbance_est_1pm=path.curvature_disturbance_1pm,
+        ),
+    )

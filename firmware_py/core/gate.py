@@ -1,0 +1,99 @@
+"""The last gate. Critical for safety: nothing is sent that has not passed here.
+
+It bounds every command by the car's limits, independently of the law, and decides by mode whether the vehicle is to
+follow at all. A value that is no number never passes and never stays.
+"""
+
+import math
+from typing import NamedTuple
+
+from firmware_py.core.signals import MODE_ACTIVE, MODE_FAULT
+from firmware_py.core.speed import HOLD_DECEL_MPS2
+from firmware_py.core.supervisor import STOP_EMERGENCY, STOP_RELEASE
+from firmware_py.core.tables import CarTable
+
+
+class Wanted(NamedTuple):
+    """What the law wants: road-wheel angle (left positive), travel speed (never negative), brake."""
+
+    angle_rad: float
+    travel_speed_mps: float
+    brake_decel_mps2: float
+
+
+class Passed(NamedTuple):
+    """What may be sent, and the rounding remainder of the angle that the next command makes good."""
+
+    angle_rad: float
+    angle_carry_rad: float
+    speed_mps: float
+    brake_decel_mps2: float
+    follow: int
+
+
+def is_number(value: float) -> bool:
+    """Return whether a value is finite."""
+    return value - value == 0.0
+
+
+def gate(
+    car: CarTable,
+    lsb_rad: float,
+    mode: int,
+    reaction: int,
+    standstill: bool,
+    sigma: float,
+    wanted: Wanted,
+    previous_rad: float,
+    carry_rad: float,
+    period_s: float,
+) -> Passed:
+    """Return the commands that may leave the controller.
+
+    Active: the wanted commands, bounded. Fault: steering goes on to follow the path until standstill and the brake
+    stops the car, unless the driver has taken over. Otherwise nothing is to be followed: brake held, no speed.
+    """
+    angle_rad = wanted.angle_rad
+    if not is_number(angle_rad):
+        angle_rad = previous_rad
+    speed_mps = wanted.travel_speed_mps
+    brake_mps2 = wanted.brake_decel_mps2
+    if not is_number(speed_mps) or not is_number(brake_mps2):
+        speed_mps = 0.0
+        brake_mps2 = car.controlled_decel_mps2
+
+    follow = 0
+    if mode == MODE_ACTIVE:
+        follow = 1
+    elif mode == MODE_FAULT:
+        speed_mps = 0.0
+        brake_mps2 = car.controlled_decel_mps2
+        if reaction == STOP_EMERGENCY:
+            brake_mps2 = car.emergency_decel_mps2
+        if standstill:
+            angle_rad = previous_rad
+        elif reaction != STOP_RELEASE:
+            follow = 1
+    else:
+        speed_mps = 0.0
+        brake_mps2 = HOLD_DECEL_MPS2
+
+    speed_mps = max(min(speed_mps, car.max_speed_mps), 0.0)
+    brake_mps2 = max(min(brake_mps2, car.emergency_decel_mps2), 0.0)
+    if brake_mps2 > 0.0:
+        speed_mps = 0.0
+
+    # The car's rate less one step of the bus's resolution, so that rounding stays inside it too.
+    step_rad = max(car.max_road_wheel_rate_radps * period_s - lsb_rad, 0.0)
+    angle_rad = angle_rad + carry_rad
+    angle_rad = max(min(angle_rad, previous_rad + step_rad), previous_rad - step_rad)
+    angle_rad = max(min(angle_rad, car.max_road_wheel_angle_rad - lsb_rad), lsb_rad - car.max_road_wheel_angle_rad)
+    sent_rad = math.floor(angle_rad / lsb_rad + 0.5) * lsb_rad
+    remainder_rad = max(min(angle_rad - sent_rad, lsb_rad), -lsb_rad)
+    return Passed(
+        angle_rad=sent_rad,
+        angle_carry_rad=remainder_rad,
+        speed_mps=sigma * speed_mps,
+        brake_decel_mps2=brake_mps2,
+        follow=follow,
+    )

@@ -1,0 +1,299 @@
+"""From inputs to conditions: how old each report is, and whether what it says is plausible.
+
+A rejected frame never arrives here: the age of its value grows instead. Ages count the loop's own cycles, so a
+controller that was late itself does not take its peers for silent; its own lateness is a condition of its own.
+"""
+
+from typing import NamedTuple
+
+from firmware_py.core import conditions as c
+from firmware_py.core.signals import (
+    MODE_ACTIVE,
+    MODE_FAULT,
+    MODE_READY,
+    NO_COUNTER,
+    QUALITY_FIXED,
+    Inputs,
+)
+from firmware_py.core.tables import CarTable, Tables
+
+NEVER_US = 60_000_000
+"""Age of a report that was never received."""
+
+START_POSITION_M = 0.15
+START_HEADING_RAD = 0.10
+"""Greatest distance from the start pose at which the manoeuvre may begin: a third of the clearance to a cone."""
+
+OFF_PATH_M = 0.20
+OFF_PATH_HEADING_RAD = 0.25
+"""Beyond this the clearance that the path was designed for is used up."""
+
+OVER_SPEED_SHARE = 1.2
+OVER_SPEED_MPS = 0.2
+
+STEERING_GAP_RAD = 0.08
+STEERING_GAP_US = 300_000
+"""The measured angle may differ from the nominal actuator's by what the slowest rack of the vehicle file explains."""
+
+SPEED_GAP_MPS = 0.30
+SPEED_GAP_US = 500_000
+
+WRONG_DIRECTION_MPS = 0.03
+WRONG_DIRECTION_US = 60_000
+
+STANDSTILL_MPS = 0.005
+
+JUMPS_IN_A_ROW = 3
+
+OVERRUNS_AT_ONCE = 9
+"""Skipped periods in one stall that are a fault: at ten the vehicle's watchdog (100 ms) stops the car anyway."""
+
+OVERRUN_BUCKET = 25
+"""Skipped periods that are a fault when they come together; one leaks away every OVERRUN_LEAK_CYCLES good cycles."""
+
+OVERRUN_LEAK_CYCLES = 10
+
+REJECTED_US = 60_000
+SETTLED_POSES = 50
+"""Poses to average at standstill before the start: brings 1 cm of noise below 2 mm."""
+
+
+class Ages(NamedTuple):
+    """How long ago each report last brought a usable value, microseconds of own cycles."""
+
+    sys_us: int
+    steer_us: int
+    motion_us: int
+    long_us: int
+    pose_us: int
+    oper_us: int
+    version_us: int
+
+
+class HealthState(NamedTuple):
+    """Ages of the reports, how long each implausibility has lasted, and what edges need of the last cycle."""
+
+    ages: Ages
+    steering_gap_us: int
+    speed_gap_us: int
+    wrong_direction_us: int
+    rejected_us: int
+    overrun_bucket: int
+    overrun_leak: int
+    model_speed_mps: float
+    start_was_pressed: int
+    clear_was_pressed: int
+    position_counter: int
+    attitude_counter: int
+    pose_is_new: int
+
+
+class Believed(NamedTuple):
+    """What the law believes of itself, for comparison with the reports."""
+
+    mode: int
+    direction_sigma: float
+    driving: int
+    cross_track_error_m: float
+    heading_error_rad: float
+    station_m: float
+    disbelieved: int
+    averaged: int
+    model_angle_rad: float
+    speed_sent_mps: float
+
+
+def begin() -> HealthState:
+    """Return the state before the first cycle: nothing was ever received."""
+    never = Ages(
+        sys_us=NEVER_US,
+        steer_us=NEVER_US,
+        motion_us=NEVER_US,
+        long_us=NEVER_US,
+        pose_us=NEVER_US,
+        oper_us=NEVER_US,
+        version_us=NEVER_US,
+    )
+    return HealthState(
+        ages=never,
+        steering_gap_us=0,
+        speed_gap_us=0,
+        wrong_direction_us=0,
+        rejected_us=0,
+        overrun_bucket=0,
+        overrun_leak=0,
+        model_speed_mps=0.0,
+        start_was_pressed=0,
+        clear_was_pressed=0,
+        position_counter=NO_COUNTER,
+        attitude_counter=NO_COUNTER,
+        pose_is_new=0,
+    )
+
+
+def _newest(counter: int, used_counter: int) -> int:
+    if used_counter != NO_COUNTER:
+        return used_counter
+    return counter
+
+
+def _pose_is_new(inputs: Inputs, position_counter: int, attitude_counter: int) -> bool:
+    """Return whether a usable pose is complete now: position and yaw of one sample, both of full quality.
+
+    The two frames of a sample may come in two cycles; they belong together when their counters are equal.
+    """
+    arrived = inputs.used.used_position_counter != NO_COUNTER or inputs.used.used_attitude_counter != NO_COUNTER
+    return (
+        arrived
+        and position_counter == attitude_counter
+        and inputs.position.position_quality == QUALITY_FIXED
+        and inputs.attitude.yaw_quality == QUALITY_FIXED
+    )
+
+
+def _age_us(age_us: int, is_new: bool, passed_us: int) -> int:
+    if is_new:
+        return 0
+    return min(age_us + passed_us, NEVER_US)
+
+
+def _older(ages: Ages, inputs: Inputs, pose_is_new: bool, passed_us: int) -> Ages:
+    """Return the ages one cycle later; a report that says itself that it is invalid ages on."""
+    used = inputs.used
+    steer_is_new = used.used_steer_counter != NO_COUNTER and inputs.steer.steer_angle_valid != 0
+    motion_is_new = used.used_motion_counter != NO_COUNTER and inputs.motion.speed_valid != 0
+    return Ages(
+        sys_us=_age_us(ages.sys_us, used.used_sys_counter != NO_COUNTER, passed_us),
+        steer_us=_age_us(ages.steer_us, steer_is_new, passed_us),
+        motion_us=_age_us(ages.motion_us, motion_is_new, passed_us),
+        long_us=_age_us(ages.long_us, used.used_long_counter != NO_COUNTER, passed_us),
+        pose_us=_age_us(ages.pose_us, pose_is_new, passed_us),
+        oper_us=_age_us(ages.oper_us, used.used_oper_counter != NO_COUNTER, passed_us),
+        version_us=_age_us(ages.version_us, used.used_veh_version_counter != NO_COUNTER, passed_us),
+    )
+
+
+def _lasting_us(lasting_us: int, is_present: bool, passed_us: int) -> int:
+    if is_present:
+        return min(lasting_us + passed_us, NEVER_US)
+    return 0
+
+
+def assess(
+    tables: Tables, state: HealthState, inputs: Inputs, believed: Believed, period_us: int
+) -> tuple[HealthState, int]:
+    """Return the next state and the conditions present in this cycle (bits of `conditions`)."""
+    used = inputs.used
+    timeouts = tables.timeouts
+    car = tables.car
+    active = believed.mode == MODE_ACTIVE
+    moving_allowed = active and believed.driving != 0
+    speed_mps = inputs.motion.speed_meas_mps
+
+    overruns = used.overruns_before_cycle
+    bucket = state.overrun_bucket + overruns
+    leak = state.overrun_leak + 1
+    if leak >= OVERRUN_LEAK_CYCLES:
+        leak = 0
+        bucket = max(bucket - 1, 0)
+
+    model_speed_mps = _model_speed(car, state.model_speed_mps, believed, moving_allowed, speed_mps, period_us)
+    rejecting = (
+        inputs.sys.sys_cmd_timeout != 0 or inputs.steer.steer_cmd_timeout != 0 or inputs.long.long_cmd_timeout != 0
+    )
+    position_counter = _newest(state.position_counter, used.used_position_counter)
+    attitude_counter = _newest(state.attitude_counter, used.used_attitude_counter)
+    pose_is_new = _pose_is_new(inputs, position_counter, attitude_counter)
+    ages = _older(state.ages, inputs, pose_is_new, period_us)
+    steering_gap = active and abs(inputs.steer.road_wheel_angle_meas_rad - believed.model_angle_rad) > STEERING_GAP_RAD
+    speed_gap = moving_allowed and abs(speed_mps - model_speed_mps) > SPEED_GAP_MPS
+    wrong_direction = active and speed_mps * believed.direction_sigma < -WRONG_DIRECTION_MPS
+    pose_is_new_flag = 1 if pose_is_new else 0
+    next_state = HealthState(
+        ages=ages,
+        steering_gap_us=_lasting_us(state.steering_gap_us, steering_gap, period_us),
+        speed_gap_us=_lasting_us(state.speed_gap_us, speed_gap, period_us),
+        wrong_direction_us=_lasting_us(state.wrong_direction_us, wrong_direction, period_us),
+        rejected_us=_lasting_us(state.rejected_us, active and rejecting, period_us),
+        overrun_bucket=bucket,
+        overrun_leak=leak,
+        model_speed_mps=model_speed_mps,
+        start_was_pressed=inputs.oper.oper_start,
+        clear_was_pressed=inputs.oper.oper_clear,
+        position_counter=position_counter,
+        attitude_counter=attitude_counter,
+        pose_is_new=pose_is_new_flag,
+    )
+
+    sys_lost = ages.sys_us >= timeouts.sys_us
+    steer_lost = ages.steer_us >= timeouts.steer_us
+    motion_lost = ages.motion_us >= timeouts.motion_us
+    long_lost = ages.long_us >= timeouts.long_us
+    pose_lost = ages.pose_us >= timeouts.pose_us
+    pose_poor = inputs.position.position_quality != QUALITY_FIXED or inputs.attitude.yaw_quality != QUALITY_FIXED
+    oper_lost = ages.oper_us >= timeouts.oper_us
+    version_lost = ages.version_us >= timeouts.version_us
+    standstill = not motion_lost and not long_lost and inputs.long.standstill != 0 and abs(speed_mps) < STANDSTILL_MPS
+    away_from_start = (
+        abs(believed.cross_track_error_m) > START_POSITION_M
+        or abs(believed.station_m) > START_POSITION_M
+        or abs(believed.heading_error_rad) > START_HEADING_RAD
+    )
+    off_path = abs(believed.cross_track_error_m) > OFF_PATH_M or abs(believed.heading_error_rad) > OFF_PATH_HEADING_RAD
+    over_speed = abs(speed_mps) > OVER_SPEED_SHARE * car.max_speed_mps + OVER_SPEED_MPS
+    overrun = overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET
+
+    present = (
+        c.bit(c.WAITING_FOR_REPORTS, sys_lost or steer_lost or motion_lost or long_lost or pose_lost or version_lost)
+        | c.bit(c.WAITING_FOR_OPERATOR, oper_lost)
+        | c.bit(c.DBC_HASH_MISMATCH, not version_lost and inputs.version.veh_dbc_hash != tables.dbc_hash24)
+        | c.bit(c.VEHICLE_HASH_MISMATCH, not version_lost and inputs.version.veh_vehicle_hash != tables.vehicle_hash24)
+        | c.bit(c.POSE_NOT_AT_START, away_from_start)
+        | c.bit(c.POSE_SETTLING, believed.averaged < SETTLED_POSES)
+        | c.bit(c.NOT_AT_STANDSTILL, not standstill)
+        | c.bit(c.STANDSTILL, standstill)
+        | c.bit(c.VEHICLE_NOT_READY, inputs.sys.vehicle_state != MODE_READY)
+        | c.bit(c.VEHICLE_ACTIVE, not sys_lost and inputs.sys.vehicle_state == MODE_ACTIVE)
+        | c.bit(c.OPERATOR_STOP, inputs.oper.oper_stop != 0)
+        | c.bit(c.EMERGENCY_STOP, inputs.oper.oper_estop != 0)
+        | c.bit(
+            c.DRIVER_OVERRIDE,
+            inputs.sys.driver_override != 0 or inputs.steer.steer_override != 0 or inputs.long.brake_override != 0,
+        )
+        | c.bit(
+            c.VEHICLE_FAULT,
+            inputs.sys.vehicle_state == MODE_FAULT
+            or inputs.steer.steer_fault != 0
+            or inputs.long.long_fault != 0
+            or (active and not sys_lost and inputs.sys.vehicle_state != MODE_ACTIVE),
+        )
+        | c.bit(c.SYS_REPORT_TIMEOUT, sys_lost)
+        | c.bit(c.STEER_REPORT_TIMEOUT, steer_lost)
+        | c.bit(c.MOTION_REPORT_TIMEOUT, motion_lost)
+        | c.bit(c.LONG_REPORT_TIMEOUT, long_lost)
+        | c.bit(c.POSE_TIMEOUT, pose_lost and not pose_poor)
+        | c.bit(c.OPERATOR_TIMEOUT, oper_lost)
+        | c.bit(c.POSE_INVALID, pose_lost and pose_poor)
+        | c.bit(c.POSE_JUMP, believed.disbelieved >= JUMPS_IN_A_ROW)
+        | c.bit(c.OFF_PATH, off_path)
+        | c.bit(c.OVER_SPEED, over_speed)
+        | c.bit(c.STEERING_NOT_FOLLOWING, next_state.steering_gap_us >= STEERING_GAP_US)
+        | c.bit(c.SPEED_NOT_FOLLOWING, next_state.speed_gap_us >= SPEED_GAP_US)
+        | c.bit(c.WRONG_DIRECTION, next_state.wrong_direction_us >= WRONG_DIRECTION_US)
+        | c.bit(c.CYCLE_OVERRUN, overrun)
+        | c.bit(c.COMMAND_REJECTED, next_state.rejected_us >= REJECTED_US)
+        | c.bit(c.SECOND_CONTROLLER, inputs.second_controller != 0)
+        | c.bit(c.START_PRESSED, inputs.oper.oper_start != 0 and state.start_was_pressed == 0 and not oper_lost)
+        | c.bit(c.CLEAR_PRESSED, inputs.oper.oper_clear != 0 and state.clear_was_pressed == 0 and not oper_lost)
+    )
+    return next_state, present
+
+
+def _model_speed(
+    car: CarTable, model_mps: float, believed: Believed, moving_allowed: bool, speed_mps: float, period_us: int
+) -> float:
+    """Return the speed that the nominal drive would have; at rest, and while stopping, it is the measured one."""
+    if not moving_allowed:
+        return speed_mps
+    share = period_us * 1e-6 / (car.drive_lag_s + period_us * 1e-6)
+    return model_mps + share * (believed.speed_sent_mps - model_mps)

@@ -1,0 +1,57 @@
+"""The nominal motion along the path: the one model that the observer and the predictor share.
+
+Kinematics of the rear-axle centre per metre of travel, body curvature c (DESIGN of the law: left positive, sigma = +1
+forward and -1 in reverse):
+
+    de = sigma sin(heading error) ds,    d(heading error) = sigma (c + d - k) ds
+
+with k the feedforward curvature (tyre slip included) and d the curvature disturbance. The road-wheel angle follows
+the command through a first-order lag under the car's rate limit.
+"""
+
+import math
+from typing import NamedTuple
+
+from firmware_py.core.path import locate
+from firmware_py.core.tables import CarTable, LegTable
+
+
+class PathState(NamedTuple):
+    """Where the car is relative to the path, what disturbs it, and where its wheels are in the nominal model."""
+
+    station_m: float
+    cross_track_error_m: float
+    heading_error_rad: float
+    curvature_disturbance_1pm: float
+    road_wheel_angle_rad: float
+
+
+def advance(
+    leg: LegTable, car: CarTable, state: PathState, angle_cmd_rad: float, travel_speed_mps: float, dt_s: float
+) -> PathState:
+    """Return the state after `dt_s` at constant travel speed with the command held.
+
+    `travel_speed_mps` is positive along the leg's travel. The heading changes with the mean angle of the interval,
+    which is exact for the lag (table weight) and a good approximation under the rate limit.
+    """
+    limit_rad = car.max_road_wheel_rate_radps * dt_s
+    gap_rad = angle_cmd_rad - state.road_wheel_angle_rad
+    change_rad = max(min(car.lag_alpha * gap_rad, limit_rad), -limit_rad)
+    mean_change_rad = max(min((1.0 - car.lag_mean_weight) * gap_rad, limit_rad), -limit_rad)
+    curvature_1pm = math.tan(state.road_wheel_angle_rad + mean_change_rad) / car.wheelbase_m
+
+    ds_m = travel_speed_mps * dt_s
+    reference_1pm = locate(leg, state.station_m + 0.5 * ds_m).feedforward_curvature_1pm
+    scale = 1.0 - reference_1pm * state.cross_track_error_m
+    path_ds_m = ds_m * math.cos(state.heading_error_rad) / max(scale, 0.5)
+    heading_change_rad = leg.sigma * (
+        (curvature_1pm + state.curvature_disturbance_1pm) * ds_m - reference_1pm * path_ds_m
+    )
+    mean_heading_error_rad = state.heading_error_rad + 0.5 * heading_change_rad
+    return PathState(
+        station_m=state.station_m + path_ds_m,
+        cross_track_error_m=state.cross_track_error_m + leg.sigma * math.sin(mean_heading_error_rad) * ds_m,
+        heading_error_rad=state.heading_error_rad + heading_change_rad,
+        curvature_disturbance_1pm=state.curvature_disturbance_1pm,
+        road_wheel_angle_rad=state.road_wheel_angle_rad + change_rad,
+    )

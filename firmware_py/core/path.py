@@ -1,0 +1,80 @@
+"""Where the path is: points of a leg by station, and the errors of a pose against it."""
+
+import math
+from typing import NamedTuple
+
+from firmware_py.core.tables import LegTable
+
+
+class PathPoint(NamedTuple):
+    """The path and the plan at one station."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    curvature_1pm: float
+    slip_heading_rad: float
+    feedforward_curvature_1pm: float
+    feedforward_slope_1pm2: float
+    speed_mps: float
+    accel_mps2: float
+
+
+class PoseError(NamedTuple):
+    """A pose relative to one point of the path: along travel, to the left of the body's path heading, and turned."""
+
+    along_m: float
+    cross_track_error_m: float
+    heading_error_rad: float
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """Return the angle in [-pi, pi)."""
+    return angle_rad - 2.0 * math.pi * math.floor((angle_rad + math.pi) / (2.0 * math.pi))
+
+
+def locate(leg: LegTable, station_m: float) -> PathPoint:
+    """Return the path at a station; before the start and past the end the path goes on straight."""
+    beyond_m = 0.0
+    station = station_m
+    if station < 0.0:
+        beyond_m = station
+        station = 0.0
+    elif station > leg.length_m:
+        beyond_m = station - leg.length_m
+        station = leg.length_m
+    row = math.floor(station / leg.step_m)
+    row = max(min(row, leg.last_row - 1), 0)
+    b = station / leg.step_m - row
+    a = 1.0 - b
+    n = row + 1
+    yaw_rad = a * leg.yaw_rad[row] + b * leg.yaw_rad[n]
+    travel_m = leg.sigma * beyond_m
+    return PathPoint(
+        x_m=a * leg.x_m[row] + b * leg.x_m[n] + travel_m * math.cos(yaw_rad),
+        y_m=a * leg.y_m[row] + b * leg.y_m[n] + travel_m * math.sin(yaw_rad),
+        yaw_rad=yaw_rad,
+        curvature_1pm=a * leg.curvature_1pm[row] + b * leg.curvature_1pm[n],
+        slip_heading_rad=a * leg.slip_heading_rad[row] + b * leg.slip_heading_rad[n],
+        feedforward_curvature_1pm=a * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[n],
+        feedforward_slope_1pm2=a * leg.feedforward_slope_1pm2[row] + b * leg.feedforward_slope_1pm2[n],
+        speed_mps=a * leg.speed_mps[row] + b * leg.speed_mps[n],
+        accel_mps2=a * leg.accel_mps2[row] + b * leg.accel_mps2[n],
+    )
+
+
+def pose_error(point: PathPoint, sigma: float, x_m: float, y_m: float, yaw_rad: float) -> PoseError:
+    """Return the pose relative to a path point, in the frame of the body's heading there.
+
+    `along_m` grows with travel (sigma = +1 forward, -1 reverse); the heading error is the body's against the heading
+    that it should have there, slip included.
+    """
+    dx = x_m - point.x_m
+    dy = y_m - point.y_m
+    cos_yaw = math.cos(point.yaw_rad)
+    sin_yaw = math.sin(point.yaw_rad)
+    return PoseError(
+        along_m=sigma * (dx * cos_yaw + dy * sin_yaw),
+        cross_track_error_m=dy * cos_yaw - dx * sin_yaw,
+        heading_error_rad=wrap_angle(yaw_rad - point.yaw_rad - point.slip_heading_rad),
+    )

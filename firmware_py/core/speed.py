@@ -1,0 +1,71 @@
+"""Speed along the leg: a reference that moves by the profile, followed to a stop at the last station."""
+
+from typing import NamedTuple
+
+from firmware_py.core.path import locate
+from firmware_py.core.tables import CarTable, LegTable
+
+STATION_GAIN_1PS = 0.8
+"""Speed added per metre that the car is behind its reference; slow against the drive's lag, so it never oscillates."""
+
+REFERENCE_LEAD_M = 0.10
+"""The reference waits when it is this far ahead: a car that does not follow is not chased."""
+
+CREEP_MPS = 0.04
+"""Least speed asked for on the way to the stop: below the profile's floor, above what odometry can resolve."""
+
+STOP_DECEL_MPS2 = 0.40
+"""Brake for the last centimetres, from creeping speed."""
+
+HOLD_DECEL_MPS2 = 1.5
+"""Brake at standstill: holds the car on any slope of a test area (10 % is 1 m/s^2)."""
+
+
+class SpeedState(NamedTuple):
+    """The moving reference's station, and whether the stop at the end of the leg has begun."""
+
+    reference_station_m: float
+    stopping: int
+
+
+class SpeedCommand(NamedTuple):
+    """Travel speed (never negative) and brake."""
+
+    travel_speed_mps: float
+    brake_decel_mps2: float
+
+
+def hold() -> SpeedCommand:
+    """Return the command that keeps the car at standstill."""
+    return SpeedCommand(travel_speed_mps=0.0, brake_decel_mps2=HOLD_DECEL_MPS2)
+
+
+def follow(
+    leg: LegTable, car: CarTable, state: SpeedState, station_now_m: float, travel_speed_mps: float, dt_s: float
+) -> tuple[SpeedState, SpeedCommand]:
+    """Return the next reference and the command that follows it.
+
+    The drive answers a speed command with a first-order lag, so the command leads the reference by lag times
+    acceleration. Once the remaining distance is what the brake needs, the stop begins and is not taken back.
+    """
+    remaining_m = leg.length_m - station_now_m
+    speed_mps = max(travel_speed_mps, 0.0)
+    braking_m = speed_mps * (car.brake_lag_s + 0.5 * dt_s) + 0.5 * speed_mps * speed_mps / STOP_DECEL_MPS2
+    if state.stopping != 0 or remaining_m <= braking_m:
+        return (
+            SpeedState(reference_station_m=leg.length_m, stopping=1),
+            SpeedCommand(travel_speed_mps=0.0, brake_decel_mps2=STOP_DECEL_MPS2),
+        )
+    reference = locate(leg, state.reference_station_m)
+    station_m = min(state.reference_station_m + reference.speed_mps * dt_s, leg.length_m)
+    station_m = min(station_m, station_now_m + REFERENCE_LEAD_M)
+    wanted_mps = (
+        reference.speed_mps
+        + car.drive_lag_s * reference.accel_mps2
+        + STATION_GAIN_1PS * (state.reference_station_m - station_now_m)
+    )
+    command_mps = max(min(wanted_mps, car.max_speed_mps), CREEP_MPS)
+    return (
+        SpeedState(reference_station_m=station_m, stopping=0),
+        SpeedCommand(travel_speed_mps=command_mps, brake_decel_mps2=0.0),
+    )

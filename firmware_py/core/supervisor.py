@@ -1,0 +1,186 @@
+"""The supervisor: modes, an ordered table of transitions with reasons, and what a fault asks for.
+
+The table is read from the top; the first row of the present mode whose conditions hold decides. Order is priority.
+"""
+
+from typing import NamedTuple
+
+from firmware_py.core import conditions as c
+from firmware_py.core.signals import MODE_ACTIVE, MODE_FAULT, MODE_MANUAL, MODE_READY
+
+STOP_NONE = 0
+STOP_CONTROLLED = 1
+STOP_EMERGENCY = 2
+STOP_RELEASE = 3
+"""Reactions: controlled or emergency braking while steering on, or the car given to the driver at once."""
+
+ENABLE_TIMEOUT_US = 1_000_000
+"""How long the vehicle may take to become Active after the request."""
+
+CLEAR_PULSE_US = 200_000
+"""How long the clear request is held: twice the vehicle's command timeout."""
+
+ANY = -1
+
+# What keeps Manual from Ready, in the order in which it is reported. A row: the condition is also the reason.
+_BLOCKING = (
+    c.SECOND_CONTROLLER,
+    c.WAITING_FOR_REPORTS,
+    c.WAITING_FOR_OPERATOR,
+    c.DBC_HASH_MISMATCH,
+    c.VEHICLE_HASH_MISMATCH,
+    c.EMERGENCY_STOP,
+    c.OPERATOR_STOP,
+    c.DRIVER_OVERRIDE,
+    c.VEHICLE_FAULT,
+    c.NOT_AT_STANDSTILL,
+    c.POSE_NOT_AT_START,
+    c.POSE_SETTLING,
+)
+
+# What ends Active, hardest reaction first. A row: condition, reaction.
+_STOPPING = (
+    (c.DRIVER_OVERRIDE, STOP_RELEASE),
+    (c.EMERGENCY_STOP, STOP_EMERGENCY),
+    (c.SECOND_CONTROLLER, STOP_EMERGENCY),
+    (c.CYCLE_OVERRUN, STOP_CONTROLLED),
+    (c.SYS_REPORT_TIMEOUT, STOP_CONTROLLED),
+    (c.VEHICLE_FAULT, STOP_EMERGENCY),
+    (c.STEERING_NOT_FOLLOWING, STOP_EMERGENCY),
+    (c.WRONG_DIRECTION, STOP_EMERGENCY),
+    (c.SPEED_NOT_FOLLOWING, STOP_EMERGENCY),
+    (c.OVER_SPEED, STOP_CONTROLLED),
+    (c.STEER_REPORT_TIMEOUT, STOP_CONTROLLED),
+    (c.MOTION_REPORT_TIMEOUT, STOP_CONTROLLED),
+    (c.LONG_REPORT_TIMEOUT, STOP_CONTROLLED),
+    (c.POSE_INVALID, STOP_CONTROLLED),
+    (c.POSE_TIMEOUT, STOP_CONTROLLED),
+    (c.POSE_JUMP, STOP_CONTROLLED),
+    (c.OFF_PATH, STOP_CONTROLLED),
+    (c.COMMAND_REJECTED, STOP_CONTROLLED),
+    (c.OPERATOR_TIMEOUT, STOP_CONTROLLED),
+    (c.OPERATOR_STOP, STOP_CONTROLLED),
+    (c.DIRECTION_CHANGE_TIMEOUT, STOP_CONTROLLED),
+    (c.INTERNAL_ERROR, STOP_EMERGENCY),
+)
+
+
+def _mask(*reasons: int) -> int:
+    mask = 0
+    for reason in reasons:
+        mask |= 1 << reason
+    return mask
+
+
+# (mode, conditions that must all be present, conditions that must all be absent, next mode, reason, reaction)
+TRANSITIONS: tuple[tuple[int, int, int, int, int, int], ...] = (
+    *((MODE_MANUAL, _mask(b), 0, MODE_MANUAL, b, STOP_NONE) for b in _BLOCKING),
+    (MODE_MANUAL, _mask(c.VEHICLE_NOT_READY), 0, MODE_MANUAL, c.VEHICLE_NOT_READY, STOP_NONE),
+    (MODE_MANUAL, 0, 0, MODE_READY, c.NONE, STOP_NONE),
+    *((MODE_READY, _mask(b), 0, MODE_MANUAL, b, STOP_NONE) for b in _BLOCKING),
+    (MODE_READY, _mask(c.ENABLE_REFUSED), 0, MODE_MANUAL, c.ENABLE_REFUSED, STOP_NONE),
+    (MODE_READY, _mask(c.VEHICLE_ACTIVE, c.START_PRESSED), 0, MODE_ACTIVE, c.NONE, STOP_NONE),
+    (MODE_READY, _mask(c.VEHICLE_NOT_READY), _mask(c.START_PRESSED), MODE_MANUAL, c.VEHICLE_NOT_READY, STOP_NONE),
+    *((MODE_ACTIVE, _mask(reason), 0, MODE_FAULT, reason, reaction) for reason, reaction in _STOPPING),
+    (MODE_ACTIVE, _mask(c.MANOEUVRE_DONE), 0, MODE_MANUAL, c.COMPLETE, STOP_NONE),
+    (MODE_FAULT, _mask(c.CLEAR_PRESSED, c.STANDSTILL), 0, MODE_MANUAL, c.NONE, STOP_NONE),
+)
+
+
+class SupervisorState(NamedTuple):
+    """The mode, why, what a fault asks for, and how long the present request to the vehicle has lasted."""
+
+    mode: int
+    reason: int
+    reaction: int
+    enabling: int
+    enabling_us: int
+    clearing_us: int
+
+
+def begin() -> SupervisorState:
+    """Return the state before the first cycle."""
+    return SupervisorState(
+        mode=MODE_MANUAL, reason=c.WAITING_FOR_REPORTS, reaction=STOP_NONE, enabling=0, enabling_us=0, clearing_us=0
+    )
+
+
+def find_transition(mode: int, conditions: int) -> int:
+    """Return the row of TRANSITIONS that decides for a mode, or -1 where the mode stays."""
+    for row in range(len(TRANSITIONS)):
+        when, needs, lacks, _next, _reason, _reaction = TRANSITIONS[row]
+        if when == mode and (conditions & needs) == needs and (conditions & lacks) == 0:
+            return row
+    return -1
+
+
+def decide(state: SupervisorState, conditions: int, period_us: int) -> SupervisorState:
+    """Return the supervisor's next state.
+
+    From Ready, a pressed start asks the vehicle to enable; Active begins when the vehicle reports Active. A start that
+    the vehicle does not answer within ENABLE_TIMEOUT_US is withdrawn.
+    """
+    enabling = state.enabling
+    enabling_us = state.enabling_us
+    seen = conditions & ~(1 << c.START_PRESSED)
+    if state.mode == MODE_READY:
+        if c.has(conditions, c.START_PRESSED):
+            enabling = 1
+            enabling_us = 0
+        elif enabling != 0:
+            enabling_us += period_us
+        if enabling != 0:
+            # From here on START_PRESSED means "the operator's start stands".
+            seen |= 1 << c.START_PRESSED
+            if enabling_us > ENABLE_TIMEOUT_US:
+                seen |= 1 << c.ENABLE_REFUSED
+    clearing_us = max(state.clearing_us - period_us, 0)
+    if c.has(conditions, c.CLEAR_PRESSED) and state.mode != MODE_ACTIVE and c.has(conditions, c.STANDSTILL):
+        clearing_us = CLEAR_PULSE_US
+
+    row = find_transition(state.mode, seen)
+    if row < 0:
+        return SupervisorState(
+            mode=state.mode,
+            reason=state.reason,
+            reaction=_escalated(state, conditions),
+            enabling=enabling,
+            enabling_us=enabling_us,
+            clearing_us=clearing_us,
+        )
+    mode = TRANSITIONS[row][3]
+    reason = TRANSITIONS[row][4]
+    if mode not in (MODE_READY, MODE_ACTIVE):
+        enabling = 0
+        enabling_us = 0
+    if state.mode == MODE_MANUAL and mode == MODE_MANUAL:
+        reason = _manual_reason(state.reason, reason)
+    return SupervisorState(
+        mode=mode,
+        reason=reason,
+        reaction=TRANSITIONS[row][5],
+        enabling=enabling,
+        enabling_us=enabling_us,
+        clearing_us=clearing_us,
+    )
+
+
+def _escalated(state: SupervisorState, conditions: int) -> int:
+    """Return the reaction of a standing fault: it may get harder, never softer; the first reason stays."""
+    if state.mode != MODE_FAULT:
+        return state.reaction
+    if c.has(conditions, c.DRIVER_OVERRIDE):
+        return STOP_RELEASE
+    if state.reaction == STOP_CONTROLLED and (
+        c.has(conditions, c.EMERGENCY_STOP) or c.has(conditions, c.VEHICLE_FAULT)
+    ):
+        return STOP_EMERGENCY
+    return state.reaction
+
+
+def _manual_reason(shown: int, blocking: int) -> int:
+    """Return what Manual reports: a finished manoeuvre stays visible until something other than routine blocks."""
+    routine = blocking in (c.VEHICLE_NOT_READY, c.NOT_AT_STANDSTILL, c.POSE_SETTLING)
+    if routine and shown in (c.COMPLETE, c.ENABLE_REFUSED):
+        return shown
+    return blocking

@@ -1,0 +1,92 @@
+"""The tables that the controller runs on, as the core sees them: numbers only, indexed by (direction, row).
+
+Direction index: 0 = forward, 1 = reverse. In the live loop each column is a tuple of floats; under numba it is a
+float64 array of the same shape. `firmware_py.table_file` builds them.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+Column = Sequence[float]
+
+FORWARD = 0
+REVERSE = 1
+
+# Columns of a gain schedule's row, in the order of the file.
+PREVIEW, KP, KI, KD, L_EE, L_EP, L_PE, L_PP, L_DE, L_DP = range(10)
+GAIN_COLUMNS = 10
+
+
+class LegTable(NamedTuple):
+    """One leg of the path and its speed profile over travelled station, on a uniform grid of `step_m`.
+
+    Yaw is the body's and curvature the body's (wheels to the left positive) in both directions; slopes are per metre
+    of travel. `feedforward_*` is the curvature to steer so that the rear axle follows the path with tyre slip, and
+    `slip_heading_rad` the heading that the body then has relative to the path.
+    """
+
+    sigma: float
+    step_m: float
+    length_m: float
+    last_row: int
+    x_m: Column
+    y_m: Column
+    yaw_rad: Column
+    curvature_1pm: Column
+    slip_heading_rad: Column
+    feedforward_curvature_1pm: Column
+    feedforward_slope_1pm2: Column
+    speed_mps: Column
+    accel_mps2: Column
+
+
+class GainTable(NamedTuple):
+    """Gain schedule: `gain[direction][row][column]` over `speed_grid_mps[row]`, strictly increasing from 0."""
+
+    speed_grid_mps: Column
+    last_row: int
+    gain: Sequence[Sequence[Column]]
+
+
+class CarTable(NamedTuple):
+    """The nominal car and its limits, as far as the control law needs them."""
+
+    wheelbase_m: float
+    steering_lag_s: float
+    lag_alpha: float
+    lag_mean_weight: float
+    pose_latency_samples: int
+    command_latency_samples: int
+    drive_lag_s: float
+    brake_lag_s: float
+    gear_change_s: float
+    max_road_wheel_angle_rad: float
+    max_road_wheel_rate_radps: float
+    max_speed_mps: float
+    controlled_decel_mps2: float
+    emergency_decel_mps2: float
+
+
+class Timeouts(NamedTuple):
+    """Age at which a report counts as lost, microseconds, one a message (GenMsgTimeout of the DBC)."""
+
+    sys_us: int
+    steer_us: int
+    motion_us: int
+    long_us: int
+    pose_us: int
+    oper_us: int
+    version_us: int
+
+
+class Tables(NamedTuple):
+    """All that the core knows besides its state and its inputs."""
+
+    leg: tuple[LegTable, LegTable]
+    gains: GainTable
+    car: CarTable
+    timeouts: Timeouts
+    dbc_hash24: int
+    vehicle_hash24: int
+    road_wheel_angle_lsb_rad: float
+    uses_observer: int

@@ -1,0 +1,200 @@
+"""The 100 Hz loop: pacing, drain -> cycle -> send, lateness. The only reader of a clock in the controller.
+
+Cycles start on multiples of the period of the monotonic clock. A cycle that starts late by whole periods skips them;
+it never bursts. After such a stall the loop drains once more, so that what the peers sent meanwhile is not missed.
+"""
+
+import json
+import os
+import signal
+import time
+from types import FrameType
+from typing import Any, NamedTuple
+
+from firmware_py.bus import Bus
+from firmware_py.core import conditions as c
+from firmware_py.core.signals import MODE_FAULT, MODE_MANUAL
+from firmware_py.errors import UserError
+from firmware_py.histogram import Histogram
+from firmware_py.node import ControllerNode
+from firmware_py.reasons import TEXT
+
+PERIOD_NS = 10_000_000
+
+SPIN_NS = 200_000
+"""Busy wait before each deadline, under SCHED_FIFO only: without it the scheduler takes the CPU from who burns it."""
+
+REGATHER_S = 0.001
+"""After a stall, so long is given to peers that stalled with us before their silence is judged."""
+
+LISTEN_NS = 150_000_000
+"""Before the first frame is sent, the bus is listened to for so long: longer than a controller's timeout."""
+
+STATUS_CYCLES = 20
+ENDING_CYCLES = 30
+"""After the end of the manoeuvre so many cycles more tell the vehicle that nothing is to be followed."""
+
+STOPPING_CYCLES = 1500
+"""A stop that takes longer than this (15 s) is given up: the vehicle's watchdog takes over."""
+
+
+class RunResult(NamedTuple):
+    """How the loop ended: the reason's code, whether the manoeuvre was completed, and the figures."""
+
+    reason: int
+    completed: bool
+    final: dict[str, Any]
+
+
+class Loop:
+    """Runs a controller node on a bus until the manoeuvre is over or a signal asks for the end."""
+
+    def __init__(self, node: ControllerNode, bus: Bus, *, fifo: bool, once: bool, status_fd: int | None) -> None:
+        self._node = node
+        self._bus = bus
+        self._spin_ns = SPIN_NS if fifo else 0
+        self._scheduler = "SCHED_FIFO" if fifo else "SCHED_OTHER"
+        self._once = once
+        self._status_fd = status_fd
+        self._wake = Histogram()
+        self._step = Histogram()
+        self._longest_stall = 0
+        self._signalled = False
+        self._reason = c.WAITING_FOR_REPORTS
+        self._completed = False
+
+    def run(self) -> RunResult:
+        """Run to the end; returns after the car has been told to stand and to follow nothing more."""
+        handlers = {number: signal.signal(number, self._ask_to_end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            self._listen_first()
+            self._cycles()
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        return RunResult(reason=self._reason, completed=self._completed, final=self._final())
+
+    def _ask_to_end(self, _number: int, _frame: FrameType | None) -> None:
+        self._signalled = True
+
+    def _listen_first(self) -> None:
+        """Refuse a bus on which another controller already sends: two senders would fight over the car."""
+        end_ns = time.monotonic_ns() + LISTEN_NS
+        while time.monotonic_ns() < end_ns and not self._signalled:
+            for arbitration_id, data in self._bus.drain():
+                self._node.mailbox.put(time.monotonic_ns(), arbitration_id, data)
+            if self._node.mailbox.second_controller:
+                raise UserError(f"another controller already sends on {self._bus.description}; stop it first")
+            time.sleep(0.002)
+
+    def _cycles(self) -> None:
+        node = self._node
+        bus = self._bus
+        deadline_ns = (time.monotonic_ns() // PERIOD_NS + 2) * PERIOD_NS
+        ending = 0
+        while ending < ENDING_CYCLES:
+            wake_ns = self._wait_until(deadline_ns)
+            late_ns = wake_ns - deadline_ns
+            overruns = late_ns // PERIOD_NS
+            deadline_ns += (overruns + 1) * PERIOD_NS
+
+            frames = bus.drain()
+            if overruns:
+                self._longest_stall = max(self._longest_stall, overruns)
+                time.sleep(REGATHER_S)
+                frames += bus.drain()
+            bus.send(node.cycle(wake_ns, frames, overruns, bus.send_failed))
+
+            step_ns = time.monotonic_ns() - wake_ns
+            self._wake.add(late_ns)
+            self._step.add(step_ns)
+            node.health.add(late_ns, step_ns)
+            ending = self._ending(ending)
+            if node.cycles % STATUS_CYCLES == 0:
+                self._write_status()
+
+    def _wait_until(self, deadline_ns: int) -> int:
+        """Sleep, then spin where that helps; return the time of waking, never before the deadline."""
+        rest_ns = deadline_ns - self._spin_ns - time.monotonic_ns()
+        if rest_ns > 0:
+            time.sleep(rest_ns * 1e-9)
+        now_ns = time.monotonic_ns()
+        while now_ns < deadline_ns:
+            now_ns = time.monotonic_ns()
+        return now_ns
+
+    def _ending(self, ending: int) -> int:
+        """Return how many cycles the end has lasted; 0 while the loop is to go on."""
+        node = self._node
+        seen = node.seen()
+        if seen.mode == MODE_MANUAL and seen.reason == c.COMPLETE:
+            self._completed = True
+        if self._signalled and not node.stop_requested:
+            node.stop_requested = True
+        if not self._completed or seen.mode == MODE_FAULT:
+            self._reason = seen.reason
+        else:
+            self._reason = c.COMPLETE
+        over = (self._once and (self._completed or seen.mode == MODE_FAULT)) or self._signalled
+        if not over:
+            return 0
+        if node.is_driving and ending < STOPPING_CYCLES:
+            # Stopping: the end begins when the car stands.
+            return 0
+        return ending + 1
+
+    def _write_status(self) -> None:
+        """Write one line for whoever watches; a reader that does not keep up misses lines, the loop does not wait."""
+        if self._status_fd is None:
+            return
+        seen = self._node.seen()
+        line = json.dumps(
+            {
+                **seen._asdict(),
+                "reason_text": TEXT[seen.reason],
+                "wake_late_p99_us": self._wake.quantile_us(0.99),
+                "overruns": self._node.overruns,
+            }
+        )
+        try:
+            os.write(self._status_fd, line.encode() + b"\n")
+        except BlockingIOError:
+            return
+        except OSError:
+            self._status_fd = None
+
+    def _final(self) -> dict[str, Any]:
+        node = self._node
+        mailbox = node.mailbox
+        seen = node.seen()
+        return {
+            "mode": seen.mode,
+            "leg": seen.leg,
+            "reason": self._reason,
+            "reason_text": TEXT[self._reason],
+            "completed": self._completed,
+            "cycles": node.cycles,
+            "overruns": node.overruns,
+            "longest_stall_cycles": self._longest_stall,
+            "wake_p50_us": self._wake.quantile_us(0.5),
+            "wake_p99_us": self._wake.quantile_us(0.99),
+            "wake_p999_us": self._wake.quantile_us(0.999),
+            "wake_max_us": self._wake.max_us,
+            "step_p50_us": self._step.quantile_us(0.5),
+            "step_p99_us": self._step.quantile_us(0.99),
+            "scheduler": self._scheduler,
+            "frames_sent": node.frames_sent - self._bus.send_failed,
+            "frames_received": mailbox.received,
+            "frames_lost": mailbox.lost,
+            "frames_rejected": mailbox.rejected_crc + mailbox.rejected_counter + mailbox.rejected_length,
+            "send_failed": self._bus.send_failed,
+            "internal_errors": list(node.internal_errors),
+        }
+
+
+def status_writer(enabled: bool) -> int | None:
+    """Return standard output as a descriptor that never blocks, or None."""
+    if not enabled:
+        return None
+    os.set_blocking(1, False)
+    return 1
