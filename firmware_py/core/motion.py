@@ -12,7 +12,7 @@ the command through a first-order lag under the car's rate limit.
 import math
 from typing import NamedTuple
 
-from firmware_py.core.path import locate
+from firmware_py.core.path import feedforward_curvature_1pm
 from firmware_py.core.tables import CarTable, LegTable
 
 
@@ -41,7 +41,7 @@ def advance(
     curvature_1pm = math.tan(state.road_wheel_angle_rad + mean_change_rad) / car.wheelbase_m
 
     ds_m = travel_speed_mps * dt_s
-    reference_1pm = locate(leg, state.station_m + 0.5 * ds_m).feedforward_curvature_1pm
+    reference_1pm = feedforward_curvature_1pm(leg, state.station_m + 0.5 * ds_m)
     scale = 1.0 - reference_1pm * state.cross_track_error_m
     path_ds_m = ds_m * math.cos(state.heading_error_rad) / max(scale, 0.5)
     heading_change_rad = leg.sigma * (

@@ -63,6 +63,14 @@ def locate(leg: LegTable, station_m: float) -> PathPoint:
     )
 
 
+def feedforward_curvature_1pm(leg: LegTable, station_m: float) -> float:
+    """Return the feedforward curvature at a station, held beyond the ends: `locate` for the one column of the model."""
+    station = max(min(station_m, leg.length_m), 0.0) / leg.step_m
+    row = max(min(math.floor(station), leg.last_row - 1), 0)
+    b = station - row
+    return (1.0 - b) * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[row + 1]
+
+
 def pose_error(point: PathPoint, sigma: float, x_m: float, y_m: float, yaw_rad: float) -> PoseError:
     """Return the pose relative to a path point, in the frame of the body's heading there.
 

@@ -86,6 +86,10 @@ TRANSITIONS: tuple[tuple[int, int, int, int, int, int], ...] = (
     (MODE_FAULT, _mask(c.CLEAR_PRESSED, c.STANDSTILL), 0, MODE_MANUAL, c.NONE, STOP_NONE),
 )
 
+# The rows of each mode stand together: where they begin and where the next mode's begin.
+_FIRST_ROW = tuple(min(i for i, row in enumerate(TRANSITIONS) if row[0] == mode) for mode in range(4))
+_END_ROW = tuple(max(i for i, row in enumerate(TRANSITIONS) if row[0] == mode) + 1 for mode in range(4))
+
 
 class SupervisorState(NamedTuple):
     """The mode, why, what a fault asks for, and how long the present request to the vehicle has lasted."""
@@ -107,9 +111,8 @@ def begin() -> SupervisorState:
 
 def find_transition(mode: int, conditions: int) -> int:
     """Return the row of TRANSITIONS that decides for a mode, or -1 where the mode stays."""
-    for row in range(len(TRANSITIONS)):
-        when, needs, lacks, _next, _reason, _reaction = TRANSITIONS[row]
-        if when == mode and (conditions & needs) == needs and (conditions & lacks) == 0:
+    for row in range(_FIRST_ROW[mode], _END_ROW[mode]):
+        if (conditions & TRANSITIONS[row][1]) == TRANSITIONS[row][1] and (conditions & TRANSITIONS[row][2]) == 0:
             return row
     return -1
 
