@@ -172,7 +172,7 @@ class Vehicle:
     max_road_wheel_angle_rad: Annotated[float, Parameter("rad", 0.05, 1.2)]
     max_road_wheel_rate_radps: Annotated[float, Parameter("rad/s", 0.02, 20.0)]
     steering_lag_s: Annotated[float, Parameter("s", 0.0, 2.0)]
-    pose_latency_samples: Annotated[float, Parameter("samples", 0.0, 50.0)]
+    pose_latency_samples: Annotated[float, Parameter("samples", 0.0, 40.0)]
     command_latency_samples: Annotated[float, Parameter("samples", 0.0, 100.0)]
     drive_lag_s: Annotated[float, Parameter("s", 0.0, 5.0)]
     brake_lag_s: Annotated[float, Parameter("s", 0.0, 2.0)]
