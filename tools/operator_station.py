@@ -1,0 +1,342 @@
+"""The operator station: heartbeat and push buttons in OPER_Cmd, and what the others say about themselves.
+
+`parkctl demo` plays it within its own loop; `parkctl operate` is the station alone, with keys, on any bus.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from firmware_py.reasons import TEXT
+from sim.errors import UserError
+from tools.buses import add_bus_arguments, open_bus, opened
+
+if TYPE_CHECKING:
+    import argparse
+
+    import can
+
+    from sim.can_side import CanSide
+
+DBC = Path(__file__).resolve().parent.parent / "dbc" / "parking.dbc"
+MANUAL, READY, ACTIVE, FAULT = "Manual", "Ready", "Active", "Fault"
+COMPLETE = "Complete"
+CLEAR_HOLD_S = 0.5
+START_HOLD_S = 0.3
+POLL_S = 0.005
+"""Longest wait of a loop that plays the station: a quarter of the heartbeat's cycle time."""
+
+
+class _Description(NamedTuple):
+    """What the station needs of the DBC: ids by message, texts by signal and value, the heartbeat's cycle time."""
+
+    frame_ids: dict[str, int]
+    choices: dict[str, dict[int, str]]
+    heartbeat_ns: int
+
+
+@functools.cache
+def _describe(dbc_path: Path) -> _Description:
+    from sim.can_side import CanSide  # noqa: PLC0415
+
+    messages = {name: reception.message for name, reception in CanSide(dbc_path, nodes=()).received.items()}
+    cycle_time_ms = messages["OPER_Cmd"].cycle_time if "OPER_Cmd" in messages else None
+    if not cycle_time_ms:
+        raise UserError(f'DBC file {dbc_path}: message OPER_Cmd with the attribute "GenMsgCycleTime" is missing')
+    return _Description(
+        frame_ids={name: message.frame_id for name, message in messages.items()},
+        choices={
+            item.name: {int(number): str(choice) for number, choice in item.choices.items()}
+            for message in messages.values()
+            for item in message.signals
+            if item.choices
+        },
+        heartbeat_ns=int(cycle_time_ms) * 1_000_000,
+    )
+
+
+class Station:
+    """Heartbeat and buttons towards the bus; modes, leg, reason and standstill as heard from it.
+
+    Frames of other nodes are checked (CRC, counter) before they count. `max_late_ms` is the longest delay of a
+    heartbeat against its cycle time.
+    """
+
+    def __init__(self, dbc_path: Path) -> None:
+        from sim.can_side import CanSide  # noqa: PLC0415
+
+        description = _describe(dbc_path)
+        heard = {"CTRL_SysCmd", "CTRL_Track", "VEH_SysRpt", "VEH_LongRpt", "VEH_MotionRpt"}
+        self.side: CanSide = CanSide(dbc_path, nodes=("OPER",), check_only=set(description.frame_ids) - heard)
+        self.values: dict[str, dict[str, Any]] = {}
+        self.heard_ns: dict[str, int] = {}
+        self.start = self.stop = self.estop = self.clear = False
+        self.max_late_ms = 0.0
+        self.frame_ids = description.frame_ids
+        self._choices = description.choices
+        self._period_ns = description.heartbeat_ns
+        self._due_ns = 0
+        self._ready_ns = 0
+
+    def heartbeat(self, now_ns: int) -> tuple[int, bytes] | None:
+        """Return the frame that is due now, or None; skipped periods are not made up for."""
+        if now_ns < self._due_ns:
+            return None
+        if self._due_ns:
+            self.max_late_ms = max(self.max_late_ms, 1e-6 * (now_ns - self._due_ns))
+        self._due_ns += self._period_ns
+        if self._due_ns <= now_ns:
+            self._due_ns = now_ns + self._period_ns
+        buttons = {"start": self.start, "stop": self.stop, "estop": self.estop, "clear": self.clear}
+        return self.side.encode("OPER_Cmd", {f"oper_{name}": int(pressed) for name, pressed in buttons.items()})
+
+    def hear(self, now_ns: int, arbitration_id: int, data: bytes) -> None:
+        """Take in a frame of the bus."""
+        decoded = self.side.decode(now_ns, arbitration_id, data)
+        if decoded is not None:
+            name, values = decoded
+            self.heard_ns[name] = now_ns
+            if values:
+                self.values[name] = values
+
+    def is_silent(self, name: str, now_ns: int) -> bool:
+        """Whether no valid frame of the message has come for its timeout."""
+        return name not in self.heard_ns or now_ns - self.heard_ns[name] > self.side.timeout_ns(name)
+
+    def text(self, message: str, signal_name: str) -> str:
+        """Return a signal's newest value as the DBC's value table names it; empty where nothing was heard."""
+        value = self.values.get(message, {}).get(signal_name)
+        return "" if value is None else self._choices.get(signal_name, {}).get(int(value), str(value))
+
+    @property
+    def mode(self) -> str:
+        """The controller's mode."""
+        return self.text("CTRL_SysCmd", "control_mode")
+
+    @property
+    def leg(self) -> str:
+        """The leg that the controller drives."""
+        return self.text("CTRL_SysCmd", "control_leg")
+
+    @property
+    def reason(self) -> str:
+        """Why the controller is not Active."""
+        return self.text("CTRL_SysCmd", "control_reason")
+
+    @property
+    def standstill(self) -> bool:
+        """Whether the vehicle reports standstill."""
+        return bool(self.values.get("VEH_LongRpt", {}).get("standstill", 0))
+
+    @property
+    def reason_text(self) -> str:
+        """The controller's reason in plain words, with its name."""
+        values = self.values.get("CTRL_SysCmd")
+        if values is None:
+            return "the controller has not been heard on the bus"
+        return f"{TEXT.get(int(values['control_reason']), 'unknown reason')} ({self.reason})"
+
+    def press_start_when_ready(self, now_ns: int) -> None:
+        """Press start for a moment each time the controller becomes Ready."""
+        if self.mode != READY:
+            self._ready_ns = 0
+        elif not self._ready_ns:
+            self._ready_ns = now_ns
+        self.start = bool(self._ready_ns) and now_ns - self._ready_ns < int(1e9 * START_HOLD_S)
+
+
+def text_of_state(station: Station, now_ns: int) -> str:
+    """Return one line on how controller and vehicle are."""
+    if station.is_silent("CTRL_SysCmd", now_ns):
+        controller = "controller silent"
+    else:
+        controller = f"controller {station.mode}, {station.leg}, {station.reason}"
+    if station.is_silent("VEH_SysRpt", now_ns):
+        return f"{controller} | vehicle silent"
+    motion = "standstill" if station.standstill else f"{station.values['VEH_MotionRpt']['speed_meas_mps']:+.2f} m/s"
+    vehicle = f"vehicle {station.text('VEH_SysRpt', 'vehicle_state')}, {station.text('VEH_SysRpt', 'vehicle_reason')}"
+    return f"{controller} | {vehicle}, {motion}"
+
+
+KEYS = "s start   space stop   e emergency stop   c clear   q quit"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `parkctl operate`."""
+    add_bus_arguments(parser, default_text="else CAN_* variables and can.conf count, then loopbus")
+    parser.add_argument(
+        "--dbc", default=str(DBC), metavar="FILE", help="message description (default: the shipped DBC)"
+    )
+    parser.add_argument(
+        "--auto",
+        action="store_true",
+        help="no keys: press start when the controller is Ready, end when it has finished",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Be the operator station until the operator quits; with --auto until the manoeuvre is over.
+
+    Exit status 0 where the operator quit, or the manoeuvre was completed; 1 where the controller stopped with a fault.
+    """
+    if not args.auto and not sys.stdin.isatty():
+        raise UserError("operate: its keys need a terminal; use --auto to press start without one")
+    station = Station(Path(args.dbc))
+    interface, channel = args.interface, args.channel
+    if interface is None and not _is_configured():
+        interface = "loopbus"
+    with opened(open_bus(interface, channel, args.bitrate, ignore_settings=interface is not None)) as bus:
+        return _Console(station, bus, auto=args.auto).run()
+
+
+def _is_configured() -> bool:
+    import can  # noqa: PLC0415
+
+    return bool(can.util.load_file_config().get("interface") or can.util.load_environment_config().get("interface"))
+
+
+class _Console:
+    """The station with its keys and its lines."""
+
+    def __init__(self, station: Station, bus: can.BusABC, *, auto: bool) -> None:
+        self._station = station
+        self._bus = bus
+        self._auto = auto
+        self._quits = 0
+        self._clear_until_ns = 0
+        self._shown = ""
+        self._was_active = False
+
+    def run(self) -> int:
+        if not self._auto:
+            print(KEYS, flush=True)
+        previous = signal.signal(signal.SIGINT, self._on_interrupt)
+        try:
+            with _keys_one_by_one(enabled=not self._auto):
+                return self._loop()
+        finally:
+            signal.signal(signal.SIGINT, previous)
+
+    def _on_interrupt(self, _number: int, _frame: FrameType | None) -> None:
+        self._quits += 1
+
+    def _loop(self) -> int:
+        station = self._station
+        while True:
+            now_ns = time.monotonic_ns()
+            exchange(self._bus, station)
+            if not self._auto:
+                self._keys(now_ns)
+            station.clear = now_ns < self._clear_until_ns
+            self._was_active |= station.mode == ACTIVE
+            if self._auto:
+                station.press_start_when_ready(now_ns)
+            elif station.mode in (ACTIVE, FAULT):
+                station.start = False
+            self._say(now_ns)
+            status = self._finished(now_ns)
+            if status is not None:
+                return status
+
+    def _finished(self, now_ns: int) -> int | None:
+        station = self._station
+        if self._quits:
+            # Leaving while the car drives would stop it by timeout; the stop button does it in good order.
+            station.stop, station.start = True, False
+            moving = not station.is_silent("VEH_LongRpt", now_ns) and not station.standstill
+            return 0 if self._quits > 1 or not moving else None
+        if self._auto and self._was_active and station.standstill:
+            if station.leg == COMPLETE:
+                return 0
+            if station.mode == FAULT or station.is_silent("CTRL_SysCmd", now_ns):
+                print(f"parkctl: stopped: {station.reason_text}", file=sys.stderr)
+                return 1
+        return None
+
+    def _keys(self, now_ns: int) -> None:
+        while select.select([sys.stdin], [], [], 0)[0]:
+            key = os.read(sys.stdin.fileno(), 1).decode(errors="replace").lower()
+            station = self._station
+            if key == "s":
+                station.stop, station.start = False, True
+            elif key == " ":
+                station.stop, station.start = True, False
+            elif key == "e":
+                station.estop, station.start = True, False
+            elif key == "c":
+                station.estop = station.stop = False
+                self._clear_until_ns = now_ns + int(1e9 * CLEAR_HOLD_S)
+            elif key in {"q", ""}:
+                self._quits += 1
+                if not key:
+                    return
+
+    def _say(self, now_ns: int) -> None:
+        pressed = [name for name in ("start", "stop", "estop", "clear") if getattr(self._station, name)]
+        text = text_of_state(self._station, now_ns) + (f" | pressed: {', '.join(pressed)}" if pressed else "")
+        if _without_speed(text) != _without_speed(self._shown):
+            self._shown = text
+            print(text, flush=True)
+
+
+def _without_speed(text: str) -> str:
+    return " ".join(word for word in text.split() if word[0] not in "+-" and word != "m/s")
+
+
+def exchange(bus: can.BusABC, station: Station) -> list[tuple[float, int, bytes, bool]]:
+    """Send the heartbeat if due, take in all that has come, and wait at most POLL_S for more.
+
+    Returns (Unix time in s, arbitration id, data, is error frame) of every frame, the station's own included. A frame
+    that the driver refuses is not sent again: the next heartbeat follows within its cycle time.
+    """
+    import can  # noqa: PLC0415
+
+    seen: list[tuple[float, int, bytes, bool]] = []
+    now_ns = time.monotonic_ns()
+    frame = station.heartbeat(now_ns)
+    if frame is not None:
+        with contextlib.suppress(can.CanError, OSError):
+            bus.send(can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False))
+            seen.append((time.time(), *frame, False))
+    wait_s = POLL_S
+    for _ in range(256):
+        try:
+            message = bus.recv(wait_s)
+        except (can.CanError, OSError):
+            time.sleep(POLL_S)
+            break
+        if message is None:
+            break
+        wait_s = 0.0
+        data = bytes(message.data)
+        seen.append((message.timestamp, message.arbitration_id, data, message.is_error_frame))
+        if not (message.is_error_frame or message.is_extended_id or message.is_remote_frame):
+            station.hear(time.monotonic_ns(), message.arbitration_id, data)
+    return seen
+
+
+@contextlib.contextmanager
+def _keys_one_by_one(*, enabled: bool) -> Iterator[None]:
+    """Have the terminal hand over each key at once and unseen; put it back in the end."""
+    if not enabled:
+        yield
+        return
+    import termios  # noqa: PLC0415
+    import tty  # noqa: PLC0415
+
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
