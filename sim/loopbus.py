@@ -16,6 +16,7 @@ import select
 import socket
 import struct
 import sys
+import threading
 import time
 from typing import Any
 
@@ -25,7 +26,7 @@ HOST = "127.0.0.1"
 DEFAULT_PORT = 29500
 NODES = 8
 RECEIVE_BUFFER_BYTES = 4 << 20  # asked for; the kernel may give less (net.core.rmem_max)
-PROBE_PERIOD_S = 0.02  # one closed port is tried in each, in turn
+RETRY_PERIOD_S = 0.02  # one closed port is tried in each, in turn
 
 _FRAME = struct.Struct("=IB3x8s")  # linux/can.h: struct can_frame
 _EXTENDED, _REMOTE, _ERROR = 0x80000000, 0x40000000, 0x20000000
@@ -61,8 +62,9 @@ class LoopBus(can.BusABC):
         self._own_port: int = self._socket.getsockname()[1]
         self._targets = [port for port in self._ports if receive_own_messages or port != self._own_port]
         self._open = set(self._targets)  # until the kernel says otherwise
-        self._next_probe_s = 0.0
-        self._next_probe = 0
+        self._reading = threading.Lock()  # one thread may send while another receives: what is peeked at must stay
+        self._next_retry_s = 0.0
+        self._retries = 0
         self.channel_info = f"loopbus {base}, node {self._own_port - base}"
         self._can_protocol = can.CanProtocol.CAN_20
         self._send_to_all(b"")
@@ -80,12 +82,11 @@ class LoopBus(can.BusABC):
         self._send_to_all(_FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data)))
 
     def _send_to_all(self, datagram: bytes) -> None:
-        probe = None
         if len(self._open) < len(self._targets):
             self._notice_newcomers()
-            probe = self._port_to_probe()
+            self._retry_a_closed_port()
         for port in self._targets:
-            if port in self._open or port == probe:
+            if port in self._open:
                 self._send_to(port, datagram)
 
     def _send_to(self, port: int, datagram: bytes) -> None:
@@ -95,6 +96,7 @@ class LoopBus(can.BusABC):
                 return
             except ConnectionRefusedError:  # about an earlier datagram; this one has not been sent
                 self._forget_closed_ports()
+                self._notice_newcomers()  # the port may have opened since
             except OSError as error:
                 raise can.CanOperationError(f"loopbus: cannot send: {error.strerror}", error.errno) from error
 
@@ -102,9 +104,10 @@ class LoopBus(can.BusABC):
         """Read the hellos before the first frame that waits, for a node that sends without receiving."""
         for _ in range(_MAX_DATAGRAMS):
             try:
-                if self._socket.recv(1, socket.MSG_PEEK):
-                    return
-                datagram, ancillary, _flags, address = self._socket.recvmsg(0)
+                with self._reading:
+                    if self._socket.recv(1, socket.MSG_PEEK):
+                        return
+                    datagram, ancillary, _flags, address = self._socket.recvmsg(0)
             except ConnectionRefusedError:
                 self._forget_closed_ports()
             except OSError:  # nothing waits; anything worse shows when sending
@@ -112,14 +115,15 @@ class LoopBus(can.BusABC):
             else:
                 self._to_message(datagram, ancillary, address)
 
-    def _port_to_probe(self) -> int | None:
+    def _retry_a_closed_port(self) -> None:
         now_s = time.monotonic()
-        if now_s < self._next_probe_s:
-            return None
-        self._next_probe_s = now_s + PROBE_PERIOD_S
+        if now_s < self._next_retry_s:
+            return
+        self._next_retry_s = now_s + RETRY_PERIOD_S
+        self._retries += 1
         closed = [port for port in self._targets if port not in self._open]
-        self._next_probe += 1
-        return closed[self._next_probe % len(closed)]
+        if closed:
+            self._open.add(closed[self._retries % len(closed)])  # until the kernel says that it is closed still
 
     def _forget_closed_ports(self) -> None:
         """Read the kernel's reports of ports that took no datagram."""
@@ -135,7 +139,8 @@ class LoopBus(can.BusABC):
         while True:
             for _ in range(_MAX_DATAGRAMS):
                 try:
-                    datagram, ancillary, _flags, address = self._socket.recvmsg(_FRAME.size + 1, 64)
+                    with self._reading:
+                        datagram, ancillary, _flags, address = self._socket.recvmsg(_FRAME.size + 1, 64)
                 except BlockingIOError:
                     break
                 except ConnectionRefusedError:
