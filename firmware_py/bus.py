@@ -1,6 +1,7 @@
 """The CAN bus as the cycle sees it: drain all that has come, send what is due; no thread, no waiting, no exception."""
 
 import contextlib
+import logging
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -88,6 +89,7 @@ def open_bus(
     """
     import can  # noqa: PLC0415 -- heavy, and the tests of everything else do without it
 
+    logging.getLogger("can").setLevel(logging.ERROR)  # drivers also log what they raise; one line is enough
     options: dict[str, object] = {"interface": interface, "channel": channel, "bitrate": bitrate}
     options = {key: value for key, value in options.items() if value is not None}
     try:
@@ -99,11 +101,14 @@ def open_bus(
             raise UserError(f"--channel: interface {options['interface']} needs one, e.g. --channel vcan0")
         # No filters: python-can's recv(0) ends at a frame that its software filter drops, with more frames waiting.
         return Bus(can.Bus(ignore_config=True, **options))  # type: ignore[arg-type]
-    except (can.CanError, OSError, ImportError, ValueError, TypeError, AttributeError) as error:
-        # Drivers raise all of these for an interface that is not there or options that they do not know.
+    except UserError:
+        raise
+    except Exception as error:  # drivers raise anything for hardware or libraries that are not there, NameError too
         name = f"{options.get('interface', DEFAULT_INTERFACE)} {options.get('channel', '')}".strip()
-        raise UserError(f"CAN interface {name}: cannot be opened ({_one_line(error)})") from None
+        raise UserError(f"CAN interface {name}: cannot be opened ({_reason(error)})") from None
 
 
-def _one_line(error: Exception) -> str:
+def _reason(error: Exception) -> str:
+    if isinstance(error, (NameError, ImportError)):  # kvaser's way of saying that its library is missing
+        return "the library of its driver is not installed"
     return " ".join(str(error).split()) or type(error).__name__
