@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from sim.actuators import SteeringParameters, SteeringState, steering_target, step_speed, step_steering
 from sim.can_side import CanSide
 from sim.data_files import Course, Scenario, Side, Vehicle, check_fit, true_vehicle
-from sim.drive_by_wire import BRAKE_DECEL_MPS2, NEVER, PROTOCOL_VERSION, WATCHED, DriveByWire, State
+from sim.drive_by_wire import BRAKE_DECEL_MPS2, NEVER, PROTOCOL_VERSION, WATCHED, DriveByWire, Reason, State
 from sim.errors import UserError
 from sim.examiner import Examiner
 from sim.faults import FaultInjector, Frame
@@ -159,6 +159,11 @@ class Emulator:
     def state(self) -> State:
         """State of the drive-by-wire system."""
         return self._dbw.state
+
+    @property
+    def reason(self) -> Reason:
+        """Why the drive-by-wire system is in its state."""
+        return self._dbw.reason
 
     @property
     def control_leg(self) -> int:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from math import cos, sin
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sim.body import clearance_m, outline_of
 from sim.data_files import Course, Pose, Side, Vehicle
@@ -56,6 +56,13 @@ class Verdict(NamedTuple):
     nearest_cone: str
     legs: tuple[Leg, ...]
     mistakes: tuple[Mistake, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the card as JSON can hold it."""
+        card = self._asdict()
+        card["legs"] = [leg._asdict() for leg in self.legs]
+        card["mistakes"] = [mistake._asdict() for mistake in self.mistakes]
+        return card
 
 
 class _Run:
