@@ -14,9 +14,10 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from firmware_py import e2e
-from firmware_py.core import signals
+from firmware_py.core import conditions, signals
 from firmware_py.core.signals import NO_COUNTER, Inputs, UsedCounters
 from firmware_py.errors import UserError
+from firmware_py.reasons import TEXT
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
@@ -77,17 +78,27 @@ INPUT_MESSAGES = (
 )
 """What the controller receives, in the order of `UsedCounters` and of the structs in `Inputs`."""
 
-VALUE_TABLES = {
-    "control_mode": "MODE_",
-    "vehicle_state": "MODE_",
-    "control_leg": "LEG_",
-    "control_reason": "REASON_",
-    "gear_cmd": "GEAR_",
-    "gear_rpt": "GEAR_",
-    "position_quality": "QUALITY_",
-    "yaw_quality": "QUALITY_",
+
+def _constants(module: ModuleType, prefix: str) -> dict[str, int]:
+    """Return the constants of a module whose names begin with the prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in vars(module).items() if name.startswith(prefix)}
+
+
+_MODES = _constants(signals, "MODE_")
+_GEARS = _constants(signals, "GEAR_")
+_QUALITIES = _constants(signals, "QUALITY_")
+
+VALUE_TABLES: dict[str, dict[str, int]] = {
+    "control_mode": _MODES,
+    "vehicle_state": _MODES,
+    "control_leg": _constants(signals, "LEG_"),
+    "control_reason": {name: value for name, value in vars(conditions).items() if name.isupper() and value in TEXT},
+    "gear_cmd": _GEARS,
+    "gear_rpt": _GEARS,
+    "position_quality": _QUALITIES,
+    "yaw_quality": _QUALITIES,
 }
-"""Signals with a value table, and the prefix of the constants in `core/signals.py` that must agree with it."""
+"""Signals with a value table, and the firmware's own constants that must agree with it."""
 
 Pack = Callable[[Any, int, Any], bytes]
 Unpack = Callable[[bytes], Any]
@@ -139,8 +150,8 @@ def load_codec(dbc_path: Path) -> Codec:
     try:
         _same_names("messages", list(STRUCTS), list(by_name))
         messages = {name: _check_message(by_name[name], struct) for name, struct in STRUCTS.items()}
-        for signal_name, prefix in VALUE_TABLES.items():
-            _check_value_table(by_name, signal_name, prefix)
+        for signal_name, wanted in VALUE_TABLES.items():
+            _check_value_table(by_name, signal_name, wanted)
     except _DifferenceError as difference:
         raise UserError(f"DBC file {dbc_path}: {difference}") from None
     source = "\n\n".join(_source_of(by_name[name]) for name in STRUCTS)
@@ -219,17 +230,13 @@ def _check_message(message: "Message", struct: type[Any]) -> MessageInfo:
     )
 
 
-def _check_value_table(by_name: dict[str, "Message"], signal_name: str, prefix: str) -> None:
+def _check_value_table(by_name: dict[str, "Message"], signal_name: str, wanted: dict[str, int]) -> None:
     signal = next(s for message in by_name.values() for s in message.signals if s.name == signal_name)
-    found = {str(text).lower(): value for value, text in (signal.choices or {}).items()}
-    for constant, value in _constants(signals, prefix).items():
-        text = constant.removeprefix(prefix).title().replace("_", "")
-        if found.get(text.lower()) != value:
+    found = {value: str(text) for value, text in (signal.choices or {}).items()}
+    for constant, value in wanted.items():
+        text = constant.title().replace("_", "")
+        if found.get(value) != text:
             raise _DifferenceError(f'value table of {signal_name} must have {value} "{text}"')
-
-
-def _constants(module: ModuleType, prefix: str) -> dict[str, int]:
-    return {name: value for name, value in vars(module).items() if name.startswith(prefix)}
 
 
 # ------------------------------------------------------------------------------------------------------- generating

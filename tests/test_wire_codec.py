@@ -19,6 +19,7 @@ from firmware_py import e2e
 from firmware_py.codec import INPUT_MESSAGES, STRUCTS, Codec, Mailbox, Sender, load_codec
 from firmware_py.core.signals import NO_COUNTER, Inputs, LongCommand, SteerCommand, UsedCounters
 from firmware_py.errors import UserError
+from firmware_py.reasons import TEXT
 from sim.can_side import CanSide
 
 DBC = Path(__file__).resolve().parent.parent / "dbc/parking.dbc"
@@ -394,6 +395,7 @@ REFUSED = [
     ),
     ("gear", edited('VAL_ 513 gear_cmd 0 "None" 1 "Park"', 'VAL_ 513 gear_cmd 1 "None" 0 "Park"'), "gear_cmd"),
     ("mode", edited('VAL_ 32 vehicle_state 0 "Manual"', 'VAL_ 32 vehicle_state 0 "Off"'), '0 "Manual"'),
+    ("reason", edited('19 "PoseInvalid" 20 "PoseJump"', '20 "PoseInvalid" 19 "PoseJump"'), '19 "PoseInvalid"'),
     ("no_table", edited("VAL_ 1537 yaw_quality", "VAL_ 1536 yaw_quality"), "yaw_quality"),
     ("no_cycle", edited('BA_ "GenMsgCycleTime" BO_ 257 10;\n', ""), "VEH_MotionRpt lacks the attribute"),
     ("no_timeout", edited('BA_ "GenMsgTimeout" BO_ 1537 100;\n', ""), 'LOC_Attitude lacks the attribute "GenMsgTime'),
@@ -476,6 +478,16 @@ def test_what_the_codec_says_of_messages_is_the_dbc_s() -> None:
     assert {name: side.timeout_ns(name) for name in MESSAGES} == {
         name: info.timeout_ms * 1_000_000 for name, info in CODEC.messages.items()
     }
+
+
+def test_every_enumeration_of_the_firmware_is_checked_whole() -> None:
+    """All of the DBC's names but those that the firmware has no word for."""
+    tables = {s.name: s.choices for m in MESSAGES.values() for s in m.signals if s.choices}
+    assert set(tables) - set(codec_module.VALUE_TABLES) == {"vehicle_reason"}, "the vehicle's own; for people only"
+    for name, wanted in codec_module.VALUE_TABLES.items():
+        unknown = set(tables[name]) - set(wanted.values())
+        assert unknown == ({0, 1, 2} if name.endswith("_quality") else set()), name
+    assert set(codec_module.VALUE_TABLES["control_reason"].values()) == set(TEXT)
 
 
 def test_the_generated_source_is_kept_and_is_plain() -> None:
