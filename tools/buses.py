@@ -95,7 +95,7 @@ def open_bus(interface: str | None, channel: str | None, bitrate: int | None, *,
         if error.errno == errno.ENODEV:
             raise UserError(f"{name}: there is no such CAN interface (see: ip link)") from None
         raise UserError(f"{name}: {error.strerror or error}") from None
-    except (can.CanError, ImportError, TypeError, ValueError) as error:
+    except (can.CanError, ImportError, NotImplementedError, TypeError, ValueError) as error:
         raise UserError(f"{name}: {' '.join(str(error).split())}") from None
 
 

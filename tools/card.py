@@ -41,23 +41,21 @@ def print_card(console: Console, figures: dict[str, Any], course: Course) -> Non
     if exam is None:
         console.print(Panel("no verdict: the run ended before the plant could write one", title="examiner's card"))
         return
-    passed = figures["passed"]
+    passed = exam["passed"]
     lines = Table.grid(padding=(0, 2))
     lines.add_column()
     lines.add_column()
     touched = exam["cones_touched"]
-    parallel = max((abs(leg["final_heading_error_rad"]) for leg in exam["legs"]), default=0.0)
-    stop = max((abs(leg["final_ahead_m"]) for leg in exam["legs"]), default=0.0)
     lines.add_row("markers touched", ", ".join(touched) if touched else "none")
     lines.add_row(
         "stops on the way", f"{exam['stops']}, and {exam['direction_changes']} change of direction (1 allowed)"
     )
-    lines.add_row(
-        "stop and return", f"{100.0 * stop:.1f} cm off at most (allowed {100 * course.tolerances.stop_distance_m:.0f})"
-    )
-    lines.add_row(
-        "parallel", f"{DEG * parallel:.2f} deg off at most (allowed {DEG * course.tolerances.parallel_rad:.1f})"
-    )
+    if exam["legs"]:
+        allowed_cm, allowed_deg = 100 * course.tolerances.stop_distance_m, DEG * course.tolerances.parallel_rad
+        stop_cm = 100.0 * max(abs(leg["final_ahead_m"]) for leg in exam["legs"])
+        parallel_deg = DEG * max(abs(leg["final_heading_error_rad"]) for leg in exam["legs"])
+        lines.add_row("stop and return", f"{stop_cm:.1f} cm off at most (allowed {allowed_cm:.0f})")
+        lines.add_row("parallel", f"{parallel_deg:.2f} deg off at most (allowed {allowed_deg:.1f})")
     lines.add_row(
         "clearance",
         f"{exam['min_clearance_m']:.3f} m at {exam['nearest_cone']} (cone radius {course.cone_radius_m:.2f})",
@@ -92,8 +90,8 @@ def print_figures(console: Console, figures: dict[str, Any], vehicle: Vehicle) -
         table.add_row(label, unit, *(f"{factor * leg[name]:.{decimals}f}" for leg in legs), limit)
     if legs:
         console.print(table)
-    console.print(loop_line(figures), highlight=False)
-    console.print(frames_line(figures), highlight=False)
+    console.print(loop_line(figures), soft_wrap=True)
+    console.print(frames_line(figures), soft_wrap=True)
 
 
 def _us(value: Any) -> str:

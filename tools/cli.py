@@ -6,6 +6,7 @@ import argparse
 import importlib
 import os
 import sys
+from typing import NoReturn
 
 from firmware_py import errors as firmware_errors
 from sim import errors as sim_errors
@@ -40,6 +41,13 @@ each subcommand explains itself:
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise sim_errors.UserError(f"{message} (see {self.prog} --help)")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run `parkctl`; return the exit status: 0 job done, 1 not done, 2 a mistake in what was given, 130 interrupted."""
     given = sys.argv[1:] if arguments is None else arguments
@@ -57,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(given: list[str]) -> int:
     purposes = {name: purpose for name, (_, purpose) in (COMMANDS | PROCESSES).items()}
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="parkctl",
         description="A drive-by-wire car takes the Ohio manoeuvrability test by itself.",
         epilog=EPILOG,
@@ -88,7 +96,7 @@ def _own_bus(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
     """Return the emulator's arguments and environment with its bus settled; settings for real cars do not count."""
     from tools.buses import choose_own_bus, environment_without_can_settings  # noqa: PLC0415
 
-    parser = argparse.ArgumentParser(prog="parkctl emulate", add_help=False)
+    parser = _Parser(prog="parkctl emulate", add_help=False)
     parser.add_argument("-i", "--interface")
     parser.add_argument("-c", "--channel")
     parser.add_argument("-b", "--bitrate", type=int)

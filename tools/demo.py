@@ -116,11 +116,11 @@ def run(args: argparse.Namespace) -> int:
     from rich.console import Console  # noqa: PLC0415
 
     console = Console(highlight=False)
-    console.print(f"vehicle   {plan.vehicle.name}: {plan.vehicle.description}")
-    console.print(f"course    {plan.course.name}, {plan.side} side: {plan.course.description}")
-    console.print(f"scenario  {plan.scenario.name}: {plan.scenario.description}; law {plan.law}, seed {plan.seed}")
+    print(f"vehicle   {plan.vehicle.name}: {plan.vehicle.description}")
+    print(f"course    {plan.course.name}, {plan.side} side: {plan.course.description}")
+    print(f"scenario  {plan.scenario.name}: {plan.scenario.description}; law {plan.law}, seed {plan.seed}")
     with ExitStack() as stack:
-        tables = Path(args.tables) if args.tables else _tables(plan, console, stack)
+        tables = _given_tables(plan, Path(args.tables)) if args.tables else _tables(plan, stack)
         driven = _drive_lockstep(plan, tables, folder) if plan.lockstep else _drive_live(plan, tables, folder)
         return _report(plan, tables, folder, driven, console, json_file, plots=not args.no_plots)
 
@@ -151,7 +151,21 @@ def _plan(args: argparse.Namespace) -> Plan:
     )
 
 
-def _tables(plan: Plan, console: Console, stack: ExitStack) -> Path:
+def _given_tables(plan: Plan, folder: Path) -> Path:
+    """Return the user's own folder of tables. Raises UserError where it is for another car or cannot be read."""
+    from firmware_py.core.controller import PERIOD_S  # noqa: PLC0415
+    from firmware_py.table_file import load_tables  # noqa: PLC0415
+
+    made_for = load_tables(folder, plan.side, plan.law, PERIOD_S)
+    if made_for.vehicle_hash24 != plan.vehicle.hash24:
+        raise UserError(
+            f"--tables {folder}: made for another car than {plan.vehicle.name} in scenario {plan.scenario.name}; "
+            "leave --tables out and they are made now"
+        )
+    return folder
+
+
+def _tables(plan: Plan, stack: ExitStack) -> Path:
     """Return the folder of tables for the car and course: the shipped one, or one designed now.
 
     Designed tables lie in a temporary folder until the run's own is there.
@@ -161,13 +175,14 @@ def _tables(plan: Plan, console: Console, stack: ExitStack) -> Path:
     shipped = tables_folder(plan.vehicle, plan.course)
     if shipped is not None:
         return shipped
-    console.print(f"tables    none are shipped for {plan.vehicle.name} on {plan.course.name}: designing them now")
+    print(f"tables    none are shipped for {plan.vehicle.name} on {plan.course.name}: designing them now", flush=True)
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / "tables"
     design_tables(plan.vehicle, plan.course, folder)
     return folder
 
 
 def _drive_lockstep(plan: Plan, tables: Path, folder: RunFolder) -> Driven:
+    from firmware_py.core.signals import MODE_FAULT  # noqa: PLC0415
     from tools.bus_log import BusLog  # noqa: PLC0415
     from tools.figures import truth_of_rows  # noqa: PLC0415
     from tools.lockstep import run_lockstep  # noqa: PLC0415
@@ -177,10 +192,11 @@ def _drive_lockstep(plan: Plan, tables: Path, folder: RunFolder) -> Driven:
     with BusLog(folder.path / "bus.log", "lockstep") as log:
         log.add([(*frame, False) for frame in result.frames])
     write_whole(folder.path / "truth.csv", _csv_of(result.truth))
-    exam = plain(result.exam)
+    exam = result.exam.as_dict()
     write_whole(folder.path / "exam.json", json.dumps(exam, indent=2) + "\n")
     controller = {name: None if name.endswith("_us") else value for name, value in result.controller.items()}
-    why = None if controller["completed"] else f"the controller stopped the car: {controller['reason_text']}"
+    what = "the controller stopped the car" if controller["mode"] == MODE_FAULT else "the car did not start"
+    why = None if controller["completed"] else f"{what}: {controller['reason_text']}"
     return Driven(truth_of_rows(result.truth), exam, controller, why, interrupted=False)
 
 
@@ -231,15 +247,6 @@ def _csv_of(rows: list[Any]) -> str:
     if not rows:
         return ""
     return "\n".join([",".join(rows[0]._fields), *(",".join(repr(value) for value in row) for row in rows)]) + "\n"
-
-
-def plain(value: Any) -> Any:
-    """Return nested named tuples as dictionaries and lists, for JSON."""
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {name: plain(item) for name, item in value._asdict().items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return value
 
 
 def _begin_folder(plan: Plan, tables: Path, folder: RunFolder) -> None:
@@ -316,10 +323,9 @@ def _report(
     if plots and truth is not None:
         _plot(plan, folder, truth, path, legs, why)
     folder.publish()
-    console.print(f"run's folder: {folder.path}", soft_wrap=True)
+    print(f"run's folder: {folder.path}", flush=True)
     if why is None:
         return EXIT_PASSED
-    console.file.flush()
     print(f"parkctl: not passed: {why}", file=sys.stderr)
     return EXIT_INTERRUPTED if driven.interrupted else EXIT_FAILED
 
@@ -340,4 +346,5 @@ def _plot(plan: Plan, folder: RunFolder, truth: Truth, path: PathTable, legs: li
         "title": title,
     }
     swept_body(folder.path / "swept_body.png", side=plan.side, **common)  # type: ignore[arg-type]
-    signals(folder.path / "signals.png", **common)  # type: ignore[arg-type]
+    if legs:
+        signals(folder.path / "signals.png", **common)  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from firmware_py.reasons import TEXT
 from sim.errors import UserError
 from tools.bus_log import BusLog
 from tools.figures import PathTable, project
-from tools.operator_station import ACTIVE, FAULT, Station, exchange
+from tools.operator_station import ACTIVE, FAULT, MANUAL, Station, exchange
 from tools.processes import STATUS_USER_ERROR, Child
 from tools.progress import Moment, Progress
 
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 START_LIMIT_S = 30.0
 """From start of the processes to a car that drives; slow machines need seconds to load Python alone."""
+BLOCKED_LIMIT_S = 4.0
+"""A reason not to start that does not go away by itself is waited for no longer than this."""
+PASSING_REASONS = {"WaitingForReports", "WaitingForOperator", "PoseSettling", "VehicleNotReady", "None"}
 DRIVE_LIMIT_S = 180.0
 STANDSTILL_LIMIT_S = 15.0
 FAULT_LIMIT_S = 20.0
@@ -92,7 +95,7 @@ class LiveRun:
         """Keep the station going until the manoeuvre is over; return what went wrong, if anything."""
         station = self._station
         begun_s = time.monotonic()
-        active_s = fault_s = None
+        active_s = fault_s = blocked_s = None
         while True:
             self._pump()
             now_s = time.monotonic()
@@ -107,8 +110,11 @@ class LiveRun:
                 return self._emulator_gone()
             if self._controller.ended():
                 return self._controller_gone()
-            if active_s is None and now_s - begun_s > START_LIMIT_S:
-                return f"the car did not start within {START_LIMIT_S:.0f} s: {station.reason_text}"
+            if active_s is None:
+                blocked = station.mode == MANUAL and station.reason not in PASSING_REASONS
+                blocked_s = (blocked_s or now_s) if blocked else None
+                if now_s - begun_s > START_LIMIT_S or now_s - (blocked_s or now_s) > BLOCKED_LIMIT_S:
+                    return f"the car did not start: {station.reason_text}"
             if active_s is not None and now_s - active_s > DRIVE_LIMIT_S:
                 return f"the test was not over after {DRIVE_LIMIT_S:.0f} s"
             if fault_s is not None and now_s - fault_s > FAULT_LIMIT_S:

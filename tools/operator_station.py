@@ -163,7 +163,8 @@ def text_of_state(station: Station, now_ns: int) -> str:
         controller = f"controller {station.mode}, {station.leg}, {station.reason}"
     if station.is_silent("VEH_SysRpt", now_ns):
         return f"{controller} | vehicle silent"
-    motion = "standstill" if station.standstill else f"{station.values['VEH_MotionRpt']['speed_meas_mps']:+.2f} m/s"
+    speed_mps = station.values.get("VEH_MotionRpt", {}).get("speed_meas_mps", 0.0)
+    motion = "standstill" if station.standstill else f"{speed_mps:+.2f} m/s"
     vehicle = f"vehicle {station.text('VEH_SysRpt', 'vehicle_state')}, {station.text('VEH_SysRpt', 'vehicle_reason')}"
     return f"{controller} | {vehicle}, {motion}"
 

@@ -22,6 +22,7 @@ from matplotlib.patches import Circle, Polygon  # noqa: E402
 
 COLOUR = {FORWARD: "tab:blue", "reverse": "tab:red"}
 OUTLINE_STEP_M = 0.25
+LABEL_ROOM_M = 0.6
 DPI = 130
 
 
@@ -38,7 +39,9 @@ def swept_body(
 ) -> None:
     """Draw the body's outline along both legs among the cones, with the path of the rear axle, to scale."""
     outline = outline_of(vehicle)
-    figure, rows = plt.subplots(max(1, len(legs)), 1, figsize=(13, 1.0 + 4.1 * max(1, len(legs))), squeeze=False)
+    figure, rows = plt.subplots(
+        max(1, len(legs)), 1, figsize=(13, 1.1 + 5.0 * max(1, len(legs))), squeeze=False, layout="constrained"
+    )
     for axes, leg in zip(rows[:, 0], legs, strict=False):
         _swept_leg(axes, outline, course, side, truth, path, leg)
     if not legs:
@@ -73,7 +76,7 @@ def _swept_leg(
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     for at in np.searchsorted(travelled, np.arange(0.0, travelled[-1], OUTLINE_STEP_M)):
         axes.add_patch(
-            Polygon(polygon(outline, x[at], y[at], yaw[at]), fc=(*mpl.colors.to_rgb(colour), 0.05), ec="none")
+            Polygon(polygon(outline, x[at], y[at], yaw[at]), fc=(*mpl.colors.to_rgb(colour), 0.03), ec="none")
         )
         axes.add_patch(Polygon(polygon(outline, x[at], y[at], yaw[at]), fill=False, ec=colour, lw=0.3, alpha=0.5))
     for at, style, label in ((0, "--", "body at its start"), (-1, "-", "body at its stop")):
@@ -97,9 +100,10 @@ def _swept_leg(
         f"{leg.direction}: nearest to a cone's axis at {course.cones[cone].name} "
         f"(a cone counts as touched within {course.cone_radius_m:.2f} m of its axis)", fontsize=10,
     )  # fmt: skip
-    axes.margins(0.02)
     axes.autoscale_view()
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4, fontsize=8, frameon=False)
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, cones[:, 1].min() - LABEL_ROOM_M), max(high, cones[:, 1].max() + LABEL_ROOM_M))
+    axes.legend(loc="lower right", ncols=2, fontsize=8)
 
 
 def _nearest_point(corners: np.ndarray[Any, Any], point: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -115,7 +119,7 @@ def signals(
     file: Path, *, vehicle: Vehicle, course: Course, truth: Truth, path: PathTable, legs: Sequence[Leg], title: str
 ) -> None:
     """Draw speed, steering with its limits, errors and clearance of both legs over the path's station."""
-    figure, rows = plt.subplots(6, 1, figsize=(12, 17), sharex=True)
+    figure, rows = plt.subplots(6, 1, figsize=(12, 17), sharex=True, layout="constrained")
     speed, angle, rate, error, heading, clearance = rows
     for leg in legs:
         colour, name = COLOUR[leg.direction], leg.direction
@@ -160,7 +164,7 @@ def signals(
         axes.set_ylabel(label)
         axes.grid(visible=True, alpha=0.3)
         axes.margins(x=0.01)
-        axes.legend(loc="center left", bbox_to_anchor=(1.005, 0.5), fontsize=8, frameon=False)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.985), ncols=6, fontsize=8, frameon=False)
     clearance.set_xlabel("station along the path (m): the forward leg runs to the right, reverse to the left")
     figure.suptitle(title)
     _save(figure, file)
@@ -175,7 +179,6 @@ def _save(figure: Any, file: Path) -> None:
     """Write the picture whole or not at all."""
     temporary = file.with_name(f".{file.name}")
     try:
-        figure.tight_layout()
         figure.savefig(temporary, dpi=DPI, format="png")
         temporary.replace(file)
     finally:

@@ -60,8 +60,7 @@ class Child:
             try:
                 report = json.loads(line)
             except ValueError:
-                self._complaints += line + b"\n"
-                continue
+                continue  # not a report
             if isinstance(report, dict) and isinstance(report.get("final"), dict):
                 self.final = report["final"]
             elif isinstance(report, dict):
