@@ -19,7 +19,7 @@ from firmware_py import e2e
 from firmware_py.codec import INPUT_MESSAGES, STRUCTS, Codec, Mailbox, Sender, load_codec
 from firmware_py.core.signals import NO_COUNTER, Inputs, LongCommand, SteerCommand, UsedCounters
 from firmware_py.errors import UserError
-from firmware_py.reasons import TEXT
+from firmware_py.reasons import TEXT as REASON_TEXTS
 from sim.can_side import CanSide
 
 DBC = Path(__file__).resolve().parent.parent / "dbc/parking.dbc"
@@ -375,12 +375,12 @@ def test_counters_of_messages_are_independent_and_wrap_at_15() -> None:
 
 # ------------------------------------------------------------------------------------------------ what is refused
 
-TEXT = DBC.read_text()
+DBC_TEXT = DBC.read_text()
 
 
 def edited(old: str, new: str) -> str:
-    assert old in TEXT
-    return TEXT.replace(old, new)
+    assert old in DBC_TEXT
+    return DBC_TEXT.replace(old, new)
 
 
 REFUSED = [
@@ -407,7 +407,7 @@ REFUSED = [
     ("motorola", edited("SG_ steer_enable : 28|1@1+", "SG_ steer_enable : 28|1@0+"), "Intel"),
     ("29_bit", edited("BO_ 512 CTRL_SteerCmd:", f"BO_ {512 | 1 << 31} CTRL_SteerCmd:"), "11-bit"),
     ("overlap", edited("SG_ steer_enable : 28|1", "SG_ steer_enable : 20|1"), "not a valid DBC"),
-    ("unknown", TEXT + "nonsense\n", "not a valid DBC"),
+    ("unknown", DBC_TEXT + "nonsense\n", "not a valid DBC"),
     ("empty", "", "not a valid DBC"),
     ("no_messages", 'VERSION ""\n', "messages: lacks CTRL_SysCmd"),
     ("picture", "\x89PNG\r\n\x1a\n\x00", "not a valid DBC"),
@@ -487,7 +487,7 @@ def test_every_enumeration_of_the_firmware_is_checked_whole() -> None:
     for name, wanted in codec_module.VALUE_TABLES.items():
         unknown = set(tables[name]) - set(wanted.values())
         assert unknown == ({0, 1, 2} if name.endswith("_quality") else set()), name
-    assert set(codec_module.VALUE_TABLES["control_reason"].values()) == set(TEXT)
+    assert set(codec_module.VALUE_TABLES["control_reason"].values()) == set(REASON_TEXTS)
 
 
 def test_the_generated_source_is_kept_and_is_plain() -> None:
