@@ -63,7 +63,7 @@ def build_tables(table_set: TableSet, codec: Codec) -> Tables:
         dbc_hash24=codec.dbc_hash24,
         vehicle_hash24=table_set.vehicle_hash24,
         road_wheel_angle_lsb_rad=codec.scale("road_wheel_angle_cmd_rad"),
-        uses_observer=table_set.uses_observer,
+        uses_predictor=table_set.uses_predictor,
     )
 
 

@@ -37,7 +37,8 @@ GAINS_COLUMNS = (
     "l_dp",
 )
 LAWS = {"car": 1, "pid+ff": 0}
-"""The laws by name, and whether each uses the disturbance observer."""
+"""The laws by name, and whether each predicts over latency and lag. A law without observer has one in its table that
+takes each pose as it comes (l_ee = l_pp = 1, the rest 0)."""
 
 SIDES = {"left": 1.0, "right": -1.0}
 
@@ -72,7 +73,7 @@ class TableSet(NamedTuple):
     legs: tuple[LegTable, LegTable]
     gains: GainTable
     car: CarTable
-    uses_observer: int
+    uses_predictor: int
 
 
 def load_tables(folder: Path, side: str, law: str, period_s: float, dbc_folder: Path | None = None) -> TableSet:
@@ -97,7 +98,7 @@ def load_tables(folder: Path, side: str, law: str, period_s: float, dbc_folder: 
         legs=legs,
         gains=gains,
         car=car,
-        uses_observer=LAWS[law],
+        uses_predictor=LAWS[law],
     )
 
 

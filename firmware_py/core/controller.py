@@ -12,7 +12,7 @@ from firmware_py.core import conditions as c
 from firmware_py.core import gate as last_gate
 from firmware_py.core import health, limits, manoeuvre, observer, pid, predictor, speed, supervisor
 from firmware_py.core.motion import PathState
-from firmware_py.core.path import PathPoint, locate, pose_error
+from firmware_py.core.path import PathPoint, locate
 from firmware_py.core.schedule import Gains, gains_at
 from firmware_py.core.signals import (
     GEAR_NONE,
@@ -118,8 +118,8 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     if not active and not stopping_on_path:
         observed = _rest_angle(observed, inputs.steer.road_wheel_angle_meas_rad)
     ahead = predictor.predict(leg, car, observed.path, state.sent_angles_rad, travel_mps, PERIOD_S)
-    if tables.uses_observer == 0:
-        ahead = _as_measured(leg, observed, inputs, ahead.station_m)
+    if tables.uses_predictor == 0:
+        ahead = _unpredicted(observed.path, ahead.station_m)
 
     # Steering: feedforward + PID - disturbance, within the limits.
     at = locate(leg, ahead.station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
@@ -263,21 +263,13 @@ def _rest_angle(observed: observer.ObserverState, angle_rad: float) -> observer.
     )
 
 
-def _as_measured(leg: LegTable, observed: observer.ObserverState, inputs: Inputs, station_m: float) -> PathState:
-    """Return the state of a law without observer: the errors of the newest pose as it came, no disturbance known."""
-    path = observed.path
-    measured = pose_error(
-        locate(leg, path.station_m),
-        leg.sigma,
-        inputs.position.position_x_m,
-        inputs.position.position_y_m,
-        inputs.attitude.yaw_rad,
-    )
+def _unpredicted(path: PathState, station_m: float) -> PathState:
+    """Return the errors as they are at the pose's age, for a law that predicts nothing but the station."""
     return PathState(
         station_m=station_m,
-        cross_track_error_m=measured.cross_track_error_m,
-        heading_error_rad=measured.heading_error_rad,
-        curvature_disturbance_1pm=0.0,
+        cross_track_error_m=path.cross_track_error_m,
+        heading_error_rad=path.heading_error_rad,
+        curvature_disturbance_1pm=path.curvature_disturbance_1pm,
         road_wheel_angle_rad=path.road_wheel_angle_rad,
     )
 

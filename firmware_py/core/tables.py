@@ -89,4 +89,4 @@ class Tables(NamedTuple):
     dbc_hash24: int
     vehicle_hash24: int
     road_wheel_angle_lsb_rad: float
-    uses_observer: int
+    uses_predictor: int
