@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import cos, isfinite, sin
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -94,14 +94,15 @@ def _first_mistake(error: ValidationError, model: type[BaseModel]) -> str:
     mistakes = error.errors()
     # An unknown key is most often the misspelt twin of a missing one: it says more.
     mistake = next((m for m in mistakes if m["type"] == "extra_forbidden"), mistakes[0])
-    key = ""
-    for part in mistake["loc"]:
-        key += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if key else str(part)
+    key, siblings = _as_in_the_file(model, mistake["loc"])
     if mistake["type"] == "extra_forbidden":
-        known = _keys_beside(model, mistake["loc"])
-        text = f"{key}: unknown key" + (f"; known here: {', '.join(known)}" if known else "")
+        text = f"{key}: unknown key" + (f"; known here: {', '.join(siblings)}" if siblings else "")
     elif mistake["type"] == "missing":
         text = f"{key}: missing"
+    elif mistake["type"] == "union_tag_not_found":
+        text = f"{key}.rule: missing"
+    elif mistake["type"] == "union_tag_invalid":
+        text = f"{key}.rule = {mistake['ctx']['tag']!r}: must be {mistake['ctx']['expected_tags']}"
     elif mistake["type"] == "value_error":
         what = str(mistake["ctx"]["error"])
         text = f"{key}: {what}" if key else what
@@ -112,18 +113,30 @@ def _first_mistake(error: ValidationError, model: type[BaseModel]) -> str:
     return text + (f" (and {more} more)" if more else "")
 
 
-def _keys_beside(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    current: Any = model
-    for part in location[:-1]:
+def _as_in_the_file(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, list[str]]:
+    """Dotted key of a mistake, without pydantic's union tags and with lists counted from 1, and the keys beside it."""
+    key = ""
+    here: list[type[BaseModel]] = [model]
+    siblings: list[str] = []
+    for part in location:
         if isinstance(part, int):
+            key += f"[{part + 1}]"
             continue
-        if not (isinstance(current, type) and issubclass(current, BaseModel)) or part not in current.model_fields:
-            return []
-        current = current.model_fields[part].annotation
-        arguments = [a for a in getattr(current, "__args__", ()) if isinstance(a, type) and issubclass(a, BaseModel)]
-        if arguments:
-            current = arguments[0]
-    return list(current.model_fields) if isinstance(current, type) and issubclass(current, BaseModel) else []
+        siblings = list(here[0].model_fields) if len(here) == 1 else []
+        tagged = [m for m in here if "rule" in m.model_fields and part in get_args(m.model_fields["rule"].annotation)]
+        if tagged and len(here) > 1:
+            here = tagged
+            continue
+        key += f".{part}" if key else part
+        field_info = here[0].model_fields.get(part) if len(here) == 1 else None
+        here = [] if field_info is None else _models_in(field_info.annotation)
+    return key, siblings
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for argument in getattr(annotation, "__args__", ()) for model in _models_in(argument)]
 
 
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -194,8 +207,8 @@ class Vehicle:
         digest = hashlib.sha256(self.file_bytes.replace(b"\r\n", b"\n") + text.encode()).digest()
         return int.from_bytes(digest[:3], "big")
 
-    def with_overlay(self, overlay: Mapping[str, float], where: str = "overlay") -> "Vehicle":
-        """Return the same car with other nominal values; the box grows to hold them. `where` names the file in errors.
+    def with_overlay(self, overlay: Mapping[str, float], where: str = "overlay: ") -> "Vehicle":
+        """Return the same car with other nominal values; the box grows to hold them. `where` stands before errors.
 
         Overlays add up: a second one replaces the first only in the keys that both have.
         """
@@ -224,7 +237,7 @@ def check_parameters(values: Mapping[str, float], where: str) -> None:
     """Raise UserError where a key is no vehicle parameter or a value is outside the parameter's range."""
     for key, value in values.items():
         if key not in PARAMETERS:
-            raise UserError(f"{where}: {key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
+            raise UserError(f"{where}{key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
         _check_range(key, value, where)
 
 
@@ -232,7 +245,7 @@ def _check_range(key: str, value: float, where: str) -> None:
     parameter = PARAMETERS[key.split(".", maxsplit=1)[0]]
     if not (isfinite(value) and parameter.minimum <= value <= parameter.maximum):
         raise UserError(
-            f"{where}: {key} = {value!r}: must be from {parameter.minimum:g} to {parameter.maximum:g} {parameter.unit}"
+            f"{where}{key} = {value!r}: must be from {parameter.minimum:g} to {parameter.maximum:g} {parameter.unit}"
         )
 
 
@@ -240,12 +253,12 @@ def _check_whole(vehicle: Vehicle, where: str) -> None:
     """Check what takes more than one parameter."""
     if vehicle.cg_to_rear_axle_m >= vehicle.wheelbase_m:
         raise UserError(
-            f"{where}: cg_to_rear_axle_m = {vehicle.cg_to_rear_axle_m!r}: must be less than "
+            f"{where}cg_to_rear_axle_m = {vehicle.cg_to_rear_axle_m!r}: must be less than "
             f"wheelbase_m = {vehicle.wheelbase_m!r}"
         )
     if vehicle.mirror_width_m < vehicle.body_width_m:
         raise UserError(
-            f"{where}: mirror_width_m = {vehicle.mirror_width_m!r}: is the width over the mirrors, so at least "
+            f"{where}mirror_width_m = {vehicle.mirror_width_m!r}: is the width over the mirrors, so at least "
             f"body_width_m = {vehicle.body_width_m!r}"
         )
 
@@ -271,24 +284,24 @@ def load_vehicle(name_or_path: str | Path, overlay: Mapping[str, float] | None =
     path = find_file("vehicle", name_or_path)
     raw, content = _read(path)
     file = _validate(path, _VehicleFile, content)
-    where = f"{path}: [parameters]"
+    where = f"{path}: parameters."
     for key in file.parameters:
         if key not in PARAMETERS:
-            raise UserError(f"{where} {key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
+            raise UserError(f"{where}{key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
     for key, parameter in PARAMETERS.items():
         if key not in file.parameters:
             raise UserError(
-                f"{where} {key}: missing; write {key} = {{ nominal = , low = , high = , "
+                f"{where}{key}: missing; write {key} = {{ nominal = , low = , high = , "
                 f'unit = "{parameter.unit}", source = "" }}'
             )
         entry = file.parameters[key]
         if entry.unit != parameter.unit:
-            raise UserError(f'{where} {key}.unit = "{entry.unit}": must be "{parameter.unit}"')
+            raise UserError(f'{where}{key}.unit = "{entry.unit}": must be "{parameter.unit}"')
         for part in ("nominal", "low", "high"):
             _check_range(f"{key}.{part}", getattr(entry, part), where)
         if not entry.low <= entry.nominal <= entry.high:
             raise UserError(
-                f"{where} {key}: low <= nominal <= high does not hold for "
+                f"{where}{key}: low <= nominal <= high does not hold for "
                 f"{entry.low!r}, {entry.nominal!r}, {entry.high!r}"
             )
     nominal = {key: file.parameters[key].nominal for key in PARAMETERS}
@@ -503,7 +516,7 @@ def _within(minimum: float, maximum: float) -> Callable[[Draw], Draw]:
     def check(draw: Draw) -> Draw:
         low, high = draw
         if not (minimum <= low <= high <= maximum):
-            shown = repr(low) if low == high else f"[{low!r}, {high!r}]"
+            shown = repr(low) if repr(low) == repr(high) else f"[{low!r}, {high!r}]"
             raise ValueError(f"{shown} must be from {minimum:g} to {maximum:g}, the lower end first")
         return draw
 
@@ -592,15 +605,15 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     """Read and check a scenario file."""
     path = find_file("scenario", name_or_path)
     scenario = _validate(path, Scenario, _read(path)[1])
-    check_parameters(scenario.vehicle_overlay, f"{path}: [vehicle_overlay]")
+    check_parameters(scenario.vehicle_overlay, f"{path}: vehicle_overlay.")
     for low_or_high in (0, 1):
-        check_parameters({k: v[low_or_high] for k, v in scenario.plant.unknown.items()}, f"{path}: [plant.unknown]")
+        check_parameters({k: v[low_or_high] for k, v in scenario.plant.unknown.items()}, f"{path}: plant.unknown.")
     for key, (low, high) in scenario.plant.unknown.items():
         if low > high:
-            raise UserError(f"{path}: [plant.unknown] {key} = [{low!r}, {high!r}]: the lower end comes first")
+            raise UserError(f"{path}: plant.unknown.{key} = [{low!r}, {high!r}]: the lower end comes first")
     for key in scenario.plant.corners:
         if key not in PARAMETERS:
-            raise UserError(f"{path}: [plant.corners] {key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
+            raise UserError(f"{path}: plant.corners.{key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
     return scenario
 
 
@@ -612,4 +625,4 @@ def true_vehicle(vehicle: Vehicle, scenario: Scenario, seed: int, rng: random.Ra
         values[key] = getattr(vehicle, key) * (1.0 + sign * spread)
     for key, draw in scenario.plant.unknown.items():
         values[key] = rng.uniform(*draw)
-    return vehicle.with_overlay(values, f"scenario {scenario.name}")
+    return vehicle.with_overlay(values, f"scenario {scenario.name}: ")

@@ -78,7 +78,7 @@ class Emulator:
     def __init__(
         self, vehicle: Vehicle, course: Course, scenario: Scenario, side: Side, seed: int, dbc_path: Path, start_ns: int
     ) -> None:
-        nominal = vehicle.with_overlay(scenario.vehicle_overlay, f"scenario {scenario.name}: [vehicle_overlay]")
+        nominal = vehicle.with_overlay(scenario.vehicle_overlay, f"scenario {scenario.name}: vehicle_overlay.")
         check_fit(nominal, course)
         rng = random.Random(f"plant {seed}")
         true = true_vehicle(nominal, scenario, seed, rng)

@@ -63,13 +63,13 @@ class FaultEvent(BaseModel):
         for key, is_wanted in wanted.items():
             is_given = getattr(self, key) is not None
             if is_wanted and not is_given:
-                raise ValueError(f"a {self.kind} fault needs the key {key}")
+                raise ValueError(f"{self.kind} needs the key {key}")
             if is_given and not is_wanted:
-                raise ValueError(f"a {self.kind} fault has no key {key}")
+                raise ValueError(f"{self.kind} has no key {key}")
         if self.message is not None:
             known = REPORT_MESSAGES + COMMAND_MESSAGES if self.kind == "stop_message" else REPORT_MESSAGES
             if self.message not in known:
-                raise ValueError(f"message {self.message!r} is not known; a {self.kind} fault takes {', '.join(known)}")
+                raise ValueError(f"message {self.message!r} is not known; {self.kind} takes {', '.join(known)}")
         return self
 
 
