@@ -94,6 +94,9 @@ def open_bus(
     options = {key: value for key, value in options.items() if value is not None}
     try:
         if use_config:
+            configured = {**can.util.load_file_config(), **can.util.load_environment_config(), **can.rc}
+            if not configured.get("interface"):
+                options.setdefault("interface", DEFAULT_INTERFACE)
             options = {key: value for key, value in can.util.load_config(config=options).items() if value is not None}
         options.setdefault("interface", DEFAULT_INTERFACE)
         if options["interface"] != DEFAULT_INTERFACE and "channel" not in options:

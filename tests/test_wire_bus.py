@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from pathlib import Path
 from typing import Any
 
 import can
@@ -168,6 +169,20 @@ def test_without_options_the_environment_names_the_bus_where_it_may(
     monkeypatch.setenv("CAN_INTERFACE", "socketcan")
     monkeypatch.setenv("CAN_CHANNEL", "can0")
     bus = open_bus(channel=str(base), use_config=False)
+    try:
+        assert bus.description.startswith(f"loopbus {base},")
+    finally:
+        bus.close()
+
+
+def test_without_options_and_settings_the_embedded_bus_is_opened(
+    monkeypatch: pytest.MonkeyPatch, base: int, tmp_path: Path
+) -> None:
+    for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_CONFIG"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    bus = open_bus(channel=str(base))
     try:
         assert bus.description.startswith(f"loopbus {base},")
     finally:
