@@ -20,7 +20,9 @@ class Measured(NamedTuple):
 
 
 def wrap(angle_rad: float) -> float:
-    """Angle in [-pi, pi)."""
+    """Return the angle in [-pi, pi), untouched where it lies there."""
+    if -pi <= angle_rad < pi:
+        return angle_rad
     return (angle_rad + pi) % (2.0 * pi) - pi
 
 
