@@ -14,8 +14,9 @@ REFERENCE_LEAD_M = 0.10
 CREEP_MPS = 0.04
 """Least speed asked for on the way to the stop: below the profile's floor, above what odometry can resolve."""
 
-STOP_DECEL_MPS2 = 0.40
-"""Brake for the last centimetres, from creeping speed."""
+STOP_DECEL_MPS2 = 0.80
+"""Brake for the last centimetres, from creeping speed: harder than any planned deceleration, so that a car that follows
+its profile never needs it before."""
 
 HOLD_DECEL_MPS2 = 1.5
 """Brake at standstill: holds the car on any slope of a test area (10 % is 1 m/s^2)."""
