@@ -24,7 +24,6 @@ from tools.buses import (
     BusChoice,
     choose_own_bus,
     environment_without_can_settings,
-    is_physical,
     open_bus,
     opened,
     refuse_occupied_bus,
@@ -65,13 +64,6 @@ def test_the_default_bus_is_the_embedded_one_whatever_the_environment_says(monke
 def test_a_bus_that_is_not_named_in_full_is_refused(interface: str | None, channel: str | None, says: str) -> None:
     with pytest.raises(UserError, match=says):
         choose_own_bus(interface, channel, None)
-
-
-def test_what_is_physical() -> None:
-    assert is_physical(BusChoice("socketcan", "can0", None))
-    assert is_physical(BusChoice("kvaser", "0", None))
-    assert not is_physical(BusChoice("socketcan", "vcan0", None))
-    assert not is_physical(BusChoice("loopbus", "29500", None))
 
 
 def test_the_choice_reaches_the_processes_in_full() -> None:
@@ -288,7 +280,7 @@ def test_closing_leaves_nothing_behind_even_of_a_child_that_ignores_requests(mod
     child.terminate()
     time.sleep(0.1)
     assert not child.ended()
-    child.close()
+    child.close(grace_s=0.1)
     assert child.status == -signal.SIGKILL
     wait_until(
         lambda: not Path(f"/proc/{child.latest['grandchild']}").exists() or _is_zombie(child.latest["grandchild"])
@@ -508,3 +500,21 @@ def test_drive_and_emulate_become_their_processes(monkeypatch: pytest.MonkeyPatc
     assert "CAN_CHANNEL" not in emulate_environment
     assert cli.main(["emulate", "-i", "kvaser"]) == 2
     assert len(called) == 2
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_ends_the_log_and_not_the_run() -> None:
+    log = BusLog(Path("/dev/full"), "vcan0")
+    with log:
+        for tick in range(5):
+            log.add([(100.0 + tick, 0x10, bytes(8), False)])
+            log.write_due(101.0 + tick)
+    assert log.failed == "the bus log could not be written: No space left on device"
+
+
+def test_a_reader_that_has_gone_does_not_stop_the_car() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    progress = Progress(os.fdopen(write, "w"))
+    progress.show(0.0, Moment("Forward"))
+    progress.close()

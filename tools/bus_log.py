@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -15,7 +16,10 @@ Frame = tuple[float, int, bytes, bool]
 
 
 class BusLog:
-    """Writes frames to a file; `write_due` is cheap and may be called often."""
+    """Writes frames to a file; `write_due` is cheap and may be called often.
+
+    A full disk must not stop a car: what goes wrong in writing ends the log and is kept in `failed`.
+    """
 
     def __init__(self, path: Path, channel: str) -> None:
         self._file: TextIO = path.open("w", encoding="ascii")
@@ -23,6 +27,7 @@ class BusLog:
         self._held: list[Frame] = []
         self._next_write_s = 0.0
         self._last_s = 0.0
+        self.failed: str | None = None
 
     def add(self, frames: list[Frame]) -> None:
         """Take frames in."""
@@ -42,8 +47,13 @@ class BusLog:
             self._last_s = max(self._last_s, time_s)  # a clock that was set back must not make the log run backwards
             name = f"{ERROR_FRAME_ID:08X}" if is_error else f"{arbitration_id:03X}"
             lines.append(f"({self._last_s:.6f}) {self._channel} {name}#{data.hex().upper()}\n")
-        self._file.write("".join(lines))
         del self._held[:count]
+        try:
+            if self.failed is None:
+                self._file.write("".join(lines))
+                self._file.flush()
+        except OSError as error:
+            self.failed = f"the bus log could not be written: {error.strerror}"
 
     def __enter__(self) -> BusLog:
         return self
@@ -52,4 +62,5 @@ class BusLog:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._write(float("inf"))
-        self._file.close()
+        with contextlib.suppress(OSError):
+            self._file.close()

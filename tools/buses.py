@@ -64,13 +64,6 @@ def choose_own_bus(interface: str | None, channel: str | None, bitrate: int | No
     return BusChoice(interface, channel, bitrate)
 
 
-def is_physical(choice: BusChoice) -> bool:
-    """Whether real hardware may listen on the bus."""
-    return not (
-        choice.interface == "loopbus" or (choice.interface == "socketcan" and choice.channel.startswith("vcan"))
-    )
-
-
 def environment_without_can_settings() -> dict[str, str]:
     """Return the environment for a process that must not pick up a bus from CAN_* variables."""
     return {name: value for name, value in os.environ.items() if not name.startswith("CAN_")}

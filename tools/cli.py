@@ -26,6 +26,7 @@ PROCESSES = {
 
 ORDER = ("demo", "drive", "emulate", "operate", "design")
 
+STATUS_FAILED = 1
 STATUS_USER_ERROR = 2
 STATUS_INTERRUPTED = 130
 
@@ -58,6 +59,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (firmware_errors.UserError, sim_errors.UserError) as error:
         print(f"parkctl: error: {error}", file=sys.stderr)
         return STATUS_USER_ERROR
+    except BrokenPipeError:  # the reader of a pipe has gone, as in `parkctl ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return STATUS_FAILED
     except KeyboardInterrupt:
         print("parkctl: interrupted", file=sys.stderr)
         return STATUS_INTERRUPTED

@@ -19,6 +19,7 @@ from tools.run_folder import MARK, RunFolder, check_writable_file, write_whole
 if TYPE_CHECKING:
     import argparse
 
+    import can
     from rich.console import Console
 
     from sim.data_files import Course, Scenario, Side, Vehicle
@@ -120,8 +121,9 @@ def run(args: argparse.Namespace) -> int:
     print(f"course    {plan.course.name}, {plan.side} side: {plan.course.description}")
     print(f"scenario  {plan.scenario.name}: {plan.scenario.description}; law {plan.law}, seed {plan.seed}")
     with ExitStack() as stack:
+        bus = None if plan.lockstep else _quiet_bus(plan.bus, stack)
         tables = _given_tables(plan, Path(args.tables)) if args.tables else _tables(plan, stack)
-        driven = _drive_lockstep(plan, tables, folder) if plan.lockstep else _drive_live(plan, tables, folder)
+        driven = _drive_lockstep(plan, tables, folder) if bus is None else _drive_live(plan, tables, folder, bus)
         return _report(plan, tables, folder, driven, console, json_file, plots=not args.no_plots)
 
 
@@ -149,6 +151,15 @@ def _plan(args: argparse.Namespace) -> Plan:
         bus=bus,
         named={"vehicle": args.vehicle, "course": args.course, "scenario": args.scenario},
     )
+
+
+def _quiet_bus(choice: BusChoice, stack: ExitStack) -> can.BusABC:
+    """Open the bus, to be closed with the stack. Raises UserError where that fails or somebody already sends there."""
+    from tools.operator_station import Station  # noqa: PLC0415
+
+    bus = stack.enter_context(opened(open_bus(choice.interface, choice.channel, choice.bitrate, ignore_settings=True)))
+    refuse_occupied_bus(bus, choice, Station(DBC).frame_ids, LISTEN_S)
+    return bus
 
 
 def _given_tables(plan: Plan, folder: Path) -> Path:
@@ -200,7 +211,7 @@ def _drive_lockstep(plan: Plan, tables: Path, folder: RunFolder) -> Driven:
     return Driven(truth_of_rows(result.truth), exam, controller, why, interrupted=False)
 
 
-def _drive_live(plan: Plan, tables: Path, folder: RunFolder) -> Driven:
+def _drive_live(plan: Plan, tables: Path, folder: RunFolder, bus: can.BusABC) -> Driven:
     from tools.bus_log import BusLog  # noqa: PLC0415
     from tools.figures import load_path, load_truth  # noqa: PLC0415
     from tools.live_run import LiveRun  # noqa: PLC0415
@@ -213,21 +224,17 @@ def _drive_live(plan: Plan, tables: Path, folder: RunFolder) -> Driven:
     emulator = [*bus_options, *options, "--no-config", "--seed", str(plan.seed)]
     for name, value in plan.named.items():
         emulator += [f"--{name}", value]
-    station = Station(DBC)
     path = load_path(tables, plan.side)
-    bus = open_bus(plan.bus.interface, plan.bus.channel, plan.bus.bitrate, ignore_settings=True)
-    with opened(bus):
-        refuse_occupied_bus(bus, plan.bus, station.frame_ids, LISTEN_S)
-        _begin_folder(plan, tables, folder)
-        try:
-            with BusLog(folder.path / "bus.log", _log_channel(plan.bus)) as log:
-                live = LiveRun(
-                    bus=bus, station=station, log=log, progress=Progress(), path=path, realtime=plan.realtime
-                )
-                outcome = live.run(controller, emulator, folder.path)
-        except UserError:
-            folder.discard()
-            raise
+    _begin_folder(plan, tables, folder)
+    try:
+        with BusLog(folder.path / "bus.log", _log_channel(plan.bus)) as log:
+            live = LiveRun(
+                bus=bus, station=Station(DBC), log=log, progress=Progress(), path=path, realtime=plan.realtime
+            )
+            outcome = live.run(controller, emulator, folder.path)
+    except UserError:
+        folder.discard()
+        raise
     truth, exam = folder.path / "truth.csv", folder.path / "exam.json"
     return Driven(
         load_truth(truth) if truth.is_file() else None,

@@ -34,6 +34,7 @@ DRIVE_LIMIT_S = 180.0
 STANDSTILL_LIMIT_S = 15.0
 FAULT_LIMIT_S = 20.0
 END_LIMIT_S = 5.0
+NOTICE_S = 1.0
 LISTEN_S = 0.02
 PRIORITY = 10
 """Below the car's and the controller's: this process must only keep its heartbeat within the timeout."""
@@ -85,7 +86,7 @@ class LiveRun:
             self._controller.write_complaints(folder / "controller.txt")
             self._emulator.write_complaints(folder / "emulator.txt")
             if why is None:
-                why = self._unclean_end()
+                why = self._unclean_end() or self._log.failed
         final = {**self._turnaround.figures(), **(self._controller.final or {})}
         return LiveOutcome(final, why, interrupted=self._interrupts > 0)
 
@@ -160,7 +161,7 @@ class LiveRun:
         return f"interrupted in leg {leg}: {how}"
 
     def _emulator_gone(self) -> str:
-        self._pump_until(self._controller.ended, END_LIMIT_S)
+        self._pump_until(self._controller.ended, NOTICE_S)
         return self._emulator.how_it_ended()
 
     def _controller_gone(self) -> str | None:
@@ -212,7 +213,9 @@ class LiveRun:
             if child is self._emulator:
                 self._pump_until(self._stands, STANDSTILL_LIMIT_S)
             child.terminate()
-            limit_s = STANDSTILL_LIMIT_S if child is self._controller else END_LIMIT_S
+            # Without a car there is no standstill that the controller could wait for.
+            driving = child is self._controller and not self._emulator.ended()
+            limit_s = STANDSTILL_LIMIT_S if driving else END_LIMIT_S
             if not self._pump_until(child.ended, limit_s):
                 child.kill()
 

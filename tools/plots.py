@@ -40,7 +40,7 @@ def swept_body(
     """Draw the body's outline along both legs among the cones, with the path of the rear axle, to scale."""
     outline = outline_of(vehicle)
     figure, rows = plt.subplots(
-        max(1, len(legs)), 1, figsize=(13, 1.1 + 5.0 * max(1, len(legs))), squeeze=False, layout="constrained"
+        max(1, len(legs)), 1, figsize=(13, 1.1 + 4.6 * max(1, len(legs))), squeeze=False, layout="constrained"
     )
     for axes, leg in zip(rows[:, 0], legs, strict=False):
         _swept_leg(axes, outline, course, side, truth, path, leg)

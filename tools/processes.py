@@ -119,8 +119,15 @@ class Child:
         self.process.wait()
         self.listen()
 
-    def close(self) -> None:
-        """Leave nothing behind: kill the process if it still runs, close its pipes."""
+    def close(self, grace_s: float = 3.0) -> None:
+        """Leave nothing behind: a process that still runs is asked to end, then killed; its pipes are closed.
+
+        The controller stops the car when it is asked to end; it gets the time for that even where this process fails.
+        """
+        if self.process.poll() is None:
+            self.process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(grace_s)
         if self.process.poll() is None:
             self.kill()
         for pipe in (self.process.stdout, self.process.stderr):

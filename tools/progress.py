@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sys
 from typing import NamedTuple, TextIO
@@ -53,22 +54,24 @@ class Progress:
         return now_s >= self._next_s or leg != self._leg
 
     def show(self, now_s: float, moment: Moment) -> None:
-        """Show the moment."""
+        """Show the moment. A reader that has gone away is no reason to stop."""
         text = line_of(moment)
         self._leg = moment.leg
+        self._next_s = now_s + (TERMINAL_PERIOD_S if self._terminal else FILE_PERIOD_S)
         if self._terminal:
             width = shutil.get_terminal_size().columns - 1
-            self._stream.write(f"\r\x1b[K{text[:width]}")
+            self._write(f"\r\x1b[K{text[:width]}")
             self._open = True
-            self._next_s = now_s + TERMINAL_PERIOD_S
         else:
-            self._stream.write(f"{text}\n")
-            self._next_s = now_s + FILE_PERIOD_S
-        self._stream.flush()
+            self._write(f"{text}\n")
 
     def close(self) -> None:
         """End the line."""
         if self._open:
-            self._stream.write("\n")
-            self._stream.flush()
+            self._write("\n")
             self._open = False
+
+    def _write(self, text: str) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+            self._stream.flush()

@@ -1,0 +1,116 @@
+"""`parkctl demo --lockstep` from the command line to the run's folder."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+from PIL import Image
+
+from sim.body import clearance_m, outline_of
+from sim.data_files import FOLDERS, load_course, load_vehicle
+from tools import cli
+from tools.figures import load_truth
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def demo(*arguments: str, out: str = "run", expected: int = 0) -> Any:
+    """Run it; return its figures."""
+    assert cli.main(["demo", "--lockstep", "--out", out, *arguments]) == expected
+    return json.loads((Path(out) / "figures.json").read_text())
+
+
+def test_a_passed_test_and_what_it_leaves(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = demo("--side", "right", "--json", "figures.json")
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert "PASS" in shown.out
+    assert json.loads((here / "figures.json").read_text()) == figures
+    assert (figures["passed"], figures["score"], figures["cones_touched"], figures["why"]) == (True, 100, 0, None)
+    assert figures["side"] == "right"
+    assert figures["loop"]["scheduler"] == "virtual time"
+    assert figures["loop"]["wake_p99_us"] is None  # nothing is late in virtual time, and nothing is claimed
+    for name in ("swept_body.png", "signals.png"):
+        with Image.open(Path("run") / name) as picture:
+            assert min(picture.size) > 600
+            assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 100, "the picture is not empty"
+    ids = {message.arbitration_id for message in can.LogReader(Path("run") / "bus.log")}
+    assert {0x10, 0x20, 0x30, 0x200, 0x600} <= ids
+    assert not (Path("run") / "tables").exists(), "the shipped tables are not copied"
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
+    first, again = demo("--seed", "5", "--no-plots", out="a"), demo("--seed", "5", "--no-plots", out="b")
+    other = demo("--seed", "6", "--no-plots", out="c")
+    assert first == again
+    assert (Path("a") / "truth.csv").read_bytes() == (Path("b") / "truth.csv").read_bytes()
+    assert (Path("a") / "bus.log").read_bytes() == (Path("b") / "bus.log").read_bytes()
+    assert first["legs"] != other["legs"]
+
+
+def test_the_figures_agree_with_the_plants_truth() -> None:
+    """Clearance and duration computed anew from the true poses, apart from the examiner and the figures' code."""
+    figures = demo("--no-plots")
+    truth = load_truth(Path("run") / "truth.csv")
+    vehicle, course = load_vehicle("paper"), load_course("ohio")
+    outline, cones = outline_of(vehicle), course.cones_xy("left")
+    nearest = min(
+        clearance_m(outline, *pose, cones)[0] for pose in zip(truth.x_m, truth.y_m, truth.yaw_rad, strict=True)
+    )
+    assert min(leg["min_clearance_m"] for leg in figures["legs"]) == pytest.approx(nearest, abs=1e-9)
+    moving_s = 0.01 * int((truth.speed_mps != 0.0).sum())
+    assert sum(leg["duration_s"] for leg in figures["legs"]) == pytest.approx(moving_s, abs=0.05)
+    stop = course.stop_pose(vehicle, "left")
+    forward = figures["legs"][0]
+    at_rest = int((truth.speed_mps > 0.0).nonzero()[0][-1]) + 1
+    ahead = truth.x_m[at_rest] - stop.x_m
+    assert forward["final_station_error_m"] == pytest.approx(ahead, abs=1e-4)  # the path ends along x
+    assert forward["final_cross_track_m"] == pytest.approx(truth.y_m[at_rest] - stop.y_m, abs=1e-4)
+    assert forward["final_heading_error_rad"] == pytest.approx(truth.yaw_rad[at_rest], abs=1e-4)
+    assert math.isclose(forward["max_speed_mps"], float(truth.speed_mps.max()))
+
+
+def test_a_car_that_stands_a_metre_off_does_not_start(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = (FOLDERS["scenario"] / "car.toml").read_text() + "\n[start]\nahead_m = -1.0\n"
+    (here / "off.toml").write_text(scenario)
+    figures = demo("--scenario", "off.toml", expected=1)
+    assert capsys.readouterr().err.startswith("parkctl: not passed: the car did not start: the car does not stand at")
+    assert figures["legs"] == []
+    assert figures["passed"] is False
+    assert (Path("run") / "swept_body.png").is_file()
+
+
+def test_a_car_of_the_users_own_gets_tables_of_its_own(here: Path) -> None:
+    (here / "mine.toml").write_text(
+        (FOLDERS["vehicle"] / "paper.toml").read_text()
+        .replace('name = "paper"', 'name = "mine"')
+        .replace("wheelbase_m = { nominal = 4.0, low = 4.0, high = 4.0", "wheelbase_m = { nominal = 3.9, low = 3.9, high = 3.9")
+    )  # fmt: skip
+    figures = demo("--vehicle", "mine.toml", "--no-plots")
+    assert figures["vehicle"] == "mine"
+    assert figures["passed"] is True
+    assert (Path("run") / "tables" / "path.csv").is_file()
+    assert 'vehicle = "mine"' in (Path("run") / "tables" / "manifest.toml").read_text()
+
+
+def test_tables_for_another_car_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--lockstep", "--vehicle", "fusion", "--tables", str(_shipped("paper"))]) == 2
+    error = capsys.readouterr().err
+    assert "made for another car than fusion" in error
+    assert error.count("\n") == 1
+    assert not Path("runs").exists()
+
+
+def _shipped(vehicle: str) -> Path:
+    import firmware_py  # noqa: PLC0415
+
+    return Path(firmware_py.__file__).parent / "tables" / f"{vehicle}-ohio"
