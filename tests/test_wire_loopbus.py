@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import socket
+import struct
 import time
 import timeit
 
@@ -226,6 +227,27 @@ def test_a_port_held_by_another_program_is_passed_over(open_node: Open, base: in
 def test_a_channel_that_is_no_port_is_refused(channel: str | None) -> None:
     with pytest.raises(can.CanInitializationError, match=r"loopbus: channel .* is no port number from 1024 to 65528"):
         LoopBus(channel)
+
+
+def test_a_program_with_a_bare_udp_socket_can_join(open_node: Open, base: int) -> None:
+    """In any language, by what dbc/CONVENTIONS.md says of the bus."""
+    node = open_node()
+    for _ in range(5):
+        node.send(frame(0x7FF))  # to nobody
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outsider:
+        outsider.bind((HOST, base + 1))
+        outsider.settimeout(2.0)
+        others = [(HOST, base + n) for n in range(8) if n != 1]
+        for address in others:
+            outsider.sendto(b"", address)
+        node.send(frame(0x123, b"\x11\x22\x33"))
+        number, length, data = struct.unpack("=IB3x8s", outsider.recv(100))
+        assert (number, length, data) == (0x123, 3, b"\x11\x22\x33" + bytes(5))
+        for address in others:
+            outsider.sendto(struct.pack("=IB3x8s", 0x321, 8, b"abcdefgh"), address)
+        answer = node.recv(2.0)
+        assert answer is not None
+        assert (answer.arbitration_id, bytes(answer.data), answer.is_extended_id) == (0x321, b"abcdefgh", False)
 
 
 def test_only_the_loopback_address_is_used(open_node: Open) -> None:
