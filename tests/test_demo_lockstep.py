@@ -90,11 +90,10 @@ def test_a_car_that_stands_a_metre_off_does_not_start(here: Path, capsys: pytest
 
 
 def test_a_car_of_the_users_own_gets_tables_of_its_own(here: Path) -> None:
-    (here / "mine.toml").write_text(
-        (FOLDERS["vehicle"] / "paper.toml").read_text()
-        .replace('name = "paper"', 'name = "mine"')
-        .replace("wheelbase_m = { nominal = 4.0, low = 4.0, high = 4.0", "wheelbase_m = { nominal = 3.9, low = 3.9, high = 3.9")
-    )  # fmt: skip
+    text = (FOLDERS["vehicle"] / "paper.toml").read_text().replace('name = "paper"', 'name = "mine"')
+    before, after = (f"wheelbase_m = {{ nominal = {v}, low = {v}, high = {v}" for v in ("4.0", "3.9"))
+    assert before in text
+    (here / "mine.toml").write_text(text.replace(before, after))
     figures = demo("--vehicle", "mine.toml", "--no-plots")
     assert figures["vehicle"] == "mine"
     assert figures["passed"] is True

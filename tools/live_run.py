@@ -35,6 +35,8 @@ STANDSTILL_LIMIT_S = 15.0
 FAULT_LIMIT_S = 20.0
 END_LIMIT_S = 5.0
 NOTICE_S = 1.0
+NOTEWORTHY_STALL_MS = 50.0
+"""Half the shortest timeout: a longer stall of one of the processes may be why the controller stopped."""
 LISTEN_S = 0.02
 PRIORITY = 10
 """Below the car's and the controller's: this process must only keep its heartbeat within the timeout."""
@@ -64,7 +66,7 @@ class LiveRun:
         self._next_listen_s = 0.0
         self._shown_report: dict[str, Any] = {}
         self._place: tuple[float | None, float | None] = (None, None)
-        self._turnaround = _Turnaround(station)
+        self._witness = _Witness(station)
         self._controller: Child
         self._emulator: Child
 
@@ -87,7 +89,7 @@ class LiveRun:
             self._emulator.write_complaints(folder / "emulator.txt")
             if why is None:
                 why = self._unclean_end() or self._log.failed
-        final = {**self._turnaround.figures(), **(self._controller.final or {})}
+        final = {**self._witness.figures(), **(self._controller.final or {})}
         return LiveOutcome(final, why, interrupted=self._interrupts > 0)
 
     # ------------------------------------------------------------------------------------------------ the run itself
@@ -125,7 +127,7 @@ class LiveRun:
         """Do one turn of everything that must not wait: heartbeat, frames, reports, progress."""
         frames = exchange(self._bus, self._station)
         self._log.add(frames)
-        self._turnaround.add(frames)
+        self._witness.add(frames)
         now_s = time.monotonic()
         if now_s >= self._next_listen_s:
             self._next_listen_s = now_s + LISTEN_S
@@ -187,11 +189,14 @@ class LiveRun:
             worst_ms = 1e-3 * (final.get("wake_max_us") or 0.0)
             how = f"{overruns} cycles late, {stall} in a row at most, the latest by {worst_ms:.0f} ms"
             return f"{text}: {how} ({final.get('scheduler')})"
-        late = f" (the controller's loop was late by {overruns} cycles, {stall} in a row at most)" if overruns else ""
-        heartbeat = self._station.max_late_ms
-        if heartbeat > 100.0:
-            late += f" (this machine delayed the operator's heartbeat by up to {heartbeat:.0f} ms)"
-        return f"the controller stopped the car: {text}{late}"
+        stalls = []
+        if overruns:
+            stalls.append(f"the controller's loop was late by {overruns} cycles, {stall} in a row at most")
+        if self._witness.longest_silence_ms > NOTEWORTHY_STALL_MS:
+            stalls.append(f"the plant was silent for up to {self._witness.longest_silence_ms:.0f} ms")
+        if self._station.max_late_ms > NOTEWORTHY_STALL_MS:
+            stalls.append(f"the operator's heartbeat was late by up to {self._station.max_late_ms:.0f} ms")
+        return f"the controller stopped the car: {text}" + (f" ({'; '.join(stalls)})" if stalls else "")
 
     @staticmethod
     def _overrun_text() -> str:
@@ -260,19 +265,29 @@ class LiveRun:
         )
 
 
-class _Turnaround:
-    """Time from the newest localisation frame to the steering command after it, as a third party sees the bus."""
+class _Witness:
+    """What a third party sees of the bus's timing.
+
+    Turnaround: from the newest localisation frame to the steering command after it. `longest_silence_ms`: between two
+    of the plant's system reports.
+    """
 
     def __init__(self, station: Station) -> None:
         ids = station.frame_ids
-        self._sensor, self._command = ids["LOC_Attitude"], ids["CTRL_SteerCmd"]
+        self._sensor, self._command, self._report = ids["LOC_Attitude"], ids["CTRL_SteerCmd"], ids["VEH_SysRpt"]
+        self.longest_silence_ms = 0.0
         self._sensor_s: float | None = None
+        self._report_s: float | None = None
         self._samples_us: list[float] = []
 
     def add(self, frames: list[tuple[float, int, bytes, bool]]) -> None:
         for time_s, arbitration_id, _data, _is_error in frames:
             if arbitration_id == self._sensor:
                 self._sensor_s = time_s
+            elif arbitration_id == self._report:
+                silence_ms = 1e3 * (time_s - (self._report_s or time_s))
+                self.longest_silence_ms = max(self.longest_silence_ms, silence_ms)
+                self._report_s = time_s
             elif arbitration_id == self._command and self._sensor_s is not None:
                 self._samples_us.append(1e6 * (time_s - self._sensor_s))
                 self._sensor_s = None
