@@ -82,7 +82,7 @@ class SensorSet:
         drop = config.pose_drop_probability
         is_sent = drop <= 0.0 or self._rng.random() >= drop
         speed = speed_mps * self._scale
-        if config.speed_noise_mps > 0.0:
+        if config.speed_noise_mps > 0.0 and speed_mps != 0.0:  # wheels that stand still count nothing
             speed += gauss(0.0, config.speed_noise_mps)
         yaw_rate = yaw_rate_radps
         if self._walk > 0.0:

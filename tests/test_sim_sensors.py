@@ -77,6 +77,8 @@ def test_odometry_reads_too_much_and_in_steps() -> None:
 def test_speed_noise() -> None:
     errors = [m.speed_mps - 0.8 for m in samples(5000, speed_noise_mps=0.01)]
     assert statistics.stdev(errors) == pytest.approx(0.01, rel=0.04)
+    still = SensorSet(Sensors(speed_noise_mps=0.01), 1)
+    assert [still.sample(0.01, POSE, 0.0, 0.0, 0.0).speed_mps for _ in range(5)] == [0.0] * 5
 
 
 def test_resolutions_round_to_the_nearest_step() -> None:
