@@ -80,7 +80,8 @@ class DriveByWire:
         self.first_active_ns: int | None = None
         self.control_leg = 0
         self.next_event_ns = NEVER
-        """Next instant at which `at` must be called: the watchdog's deadline or the end of a gear change."""
+        """Next instant at which `at` must be called: the end of a gear change, or the earliest at which the watchdog
+        may bite; commands that come meanwhile only postpone it, so `at` then looks again."""
         self._hashes = (PROTOCOL_VERSION, dbc_hash24, vehicle_hash24)
         self._timeouts_ns = dict(timeouts_ns)
         self._last_valid_ns: dict[str, int] = {}
@@ -136,21 +137,24 @@ class DriveByWire:
         if now_ns >= self._gear_done_ns:
             self.gear = self._gear_wanted
             self._gear_done_ns = NEVER
-        if self.state is State.ACTIVE:
-            for name in WATCHED:
-                if now_ns >= self._deadline_ns(name):
-                    last = receptions[name]
-                    if last.bad_crc:
-                        self._fault(Reason.BAD_CRC)
-                    elif last.bad_counter:
-                        self._fault(Reason.BAD_COUNTER)
-                    else:
-                        self._fault(Reason.COMMAND_TIMEOUT)
-                    break
-        elif self.state is not State.FAULT:
-            self._judge_ready(now_ns, at_standstill)
         if now_ns >= self.next_event_ns:
+            if self.state is State.ACTIVE:
+                self._watch(now_ns, receptions)
             self._schedule()
+        if self.state is State.MANUAL or self.state is State.READY:
+            self._judge_ready(now_ns, at_standstill)
+
+    def _watch(self, now_ns: int, receptions: Mapping[str, Any]) -> None:
+        for name in WATCHED:
+            if now_ns >= self._deadline_ns(name):
+                last = receptions[name]
+                if last.bad_crc:
+                    self._fault(Reason.BAD_CRC)
+                elif last.bad_counter:
+                    self._fault(Reason.BAD_COUNTER)
+                else:
+                    self._fault(Reason.COMMAND_TIMEOUT)
+                return
 
     def _judge_ready(self, now_ns: int, at_standstill: bool) -> None:
         version = self._controller_version
@@ -191,7 +195,6 @@ class DriveByWire:
             self._operator_estop = int(values["oper_estop"])
             if self._operator_estop:
                 self._fault(Reason.EMERGENCY_STOP)
-        self._schedule()
 
     def _requests(self, now_ns: int, enable: int, clear: int, at_standstill: bool) -> None:
         rising = enable == 1 and self._enable == 0
@@ -208,6 +211,7 @@ class DriveByWire:
                 self._active_since_ns = now_ns
                 if self.first_active_ns is None:
                     self.first_active_ns = now_ns
+                self._schedule()
             else:
                 self.reason = Reason.NOT_AT_STANDSTILL
 

@@ -112,7 +112,17 @@ class Emulator:
         self._drive_lag_s = true.drive_lag_s
         self._brake_lag_s = true.brake_lag_s
         self._max_decel_mps2 = true.max_decel_mps2
-        self._localiser = (10.0 * nominal.pose_latency_samples, scenario.sensors.position_noise_m)
+        self._sys_rpt: dict[str, Any] = {}
+        self._steer_rpt: dict[str, Any] = {"steer_angle_valid": 1, "steer_fault": 0}
+        self._motion_rpt: dict[str, Any] = {"speed_valid": 1, "yaw_rate_valid": 1}
+        self._long_rpt: dict[str, Any] = {"long_fault": 0}
+        self._position: dict[str, Any] = {"position_quality": QUALITY_FIXED}
+        self._attitude: dict[str, Any] = {
+            "yaw_quality": QUALITY_FIXED,
+            "pose_latency_ms": 1.0e-6 * PERIOD_NS * nominal.pose_latency_samples,
+            "position_sigma_m": scenario.sensors.position_noise_m,
+        }
+        self._received_sys, self._received_steer, self._received_long = (self._wire.received[name] for name in WATCHED)
         self._dbw = DriveByWire(
             start_ns,
             self._wire.dbc_hash24,
@@ -262,7 +272,8 @@ class Emulator:
         h = span_ns * 1.0e-9 / count
         plant, steering = self._plant, self._steering
         state, steer, decel = self._state, self._steer, self._decel_mps2
-        target = steer.demand_rad if self._faults.steering_is_frozen else self._steer_target_rad
+        is_frozen = not self._faults.is_quiet and self._faults.steering_is_frozen
+        target = steer.demand_rad if is_frozen else self._steer_target_rad
         speed_target, decel_target = self._speed_target_mps, self._decel_target_mps2
         drive_lag, brake_lag, bias = self._drive_lag_s, self._brake_lag_s, steering.bias_rad
         remember = self._history.append
@@ -295,24 +306,31 @@ class Emulator:
         if name not in _HEARD:
             return
         self.advance(now_ns)
-        if self._faults.stops(name):
+        if not self._faults.is_quiet and self._faults.stops(name):
             return
-        was_active = self._dbw.state is State.ACTIVE
+        state_before = self._dbw.state
         self._dbw.accept(self._t_ns, name, values, self._state.speed_mps == 0.0)
-        if self._dbw.state is State.ACTIVE and not was_active and self._dbw.is_timed_out("CTRL_LongCmd", self._t_ns):
-            self._long = {}  # a command from long ago must not move the car
         if name == "CTRL_SteerCmd":
             self._echo_angle_rad = values["road_wheel_angle_cmd_rad"]
             if values["steer_enable"]:
                 self._pending_steer.append((self._t_ns + self._steer_latency_ns, self._echo_angle_rad))
+                if not self._steer_latency_ns:
+                    self._act()
         elif name == "CTRL_LongCmd":
             self._echo_speed_mps = values["speed_cmd_mps"]
             self._echo_decel_mps2 = values["brake_decel_cmd_mps2"]
             self._pending_long.append((self._t_ns + self._long_latency_ns, values))
-        else:
-            if self._dbw.first_active_ns is not None:
-                self._faults.begin("active", self._dbw.first_active_ns)
-            self._apply_targets()
+            if not self._long_latency_ns:
+                self._act()
+        elif self._dbw.state is not state_before:
+            self._note_new_state()
+
+    def _note_new_state(self) -> None:
+        if self._dbw.state is State.ACTIVE and self._dbw.first_active_ns is not None:
+            self._faults.begin("active", self._dbw.first_active_ns)
+            if self._dbw.is_timed_out("CTRL_LongCmd", self._t_ns):
+                self._long = {}  # a command from long ago must not move the car
+        self._apply_targets()
         self.advance(self._t_ns)
 
     # -- frames out ---------------------------------------------------------------------------------------------------
@@ -322,7 +340,6 @@ class Emulator:
         self.advance(now_ns)
         now_ns = self._t_ns
         self._dbw.at(now_ns, self._state.speed_mps == 0.0, self._wire.received)
-        self._apply_targets()
         pose = rear_axle_pose(self._plant, self._state)
         measured = self._sensors.sample(
             (now_ns - self._last_report_ns) * 1.0e-9,
@@ -379,85 +396,48 @@ class Emulator:
         )
 
     def _messages(self, now_ns: int, measured: Measured) -> list[tuple[str, dict[str, Any]]]:
-        dbw, received = self._dbw, self._wire.received
-        sys, steer, long = received["CTRL_SysCmd"], received["CTRL_SteerCmd"], received["CTRL_LongCmd"]
-        messages: list[tuple[str, dict[str, Any]]] = [
-            (
-                "VEH_SysRpt",
-                {
-                    "vehicle_state": int(dbw.state),
-                    "vehicle_reason": int(dbw.reason),
-                    "driver_override": int(dbw.driver_override_latched),
-                    "sys_cmd_timeout": int(dbw.is_timed_out("CTRL_SysCmd", now_ns)),
-                    "sys_cmd_bad_crc": int(sys.bad_crc),
-                    "sys_cmd_bad_counter": int(sys.bad_counter),
-                    "sys_cmd_rejected_count": min(self._wire.rejected_count, REJECTED_COUNT_MAX),
-                },
-            ),
-            (
-                "VEH_SteerRpt",
-                {
-                    "road_wheel_angle_meas_rad": measured.road_wheel_angle_rad,
-                    "road_wheel_angle_echo_rad": self._echo_angle_rad,
-                    "steer_angle_valid": 1,
-                    "steer_limiting_value": self._limited_value,
-                    "steer_limiting_rate": self._limited_rate,
-                    "steer_cmd_timeout": int(dbw.is_timed_out("CTRL_SteerCmd", now_ns)),
-                    "steer_cmd_bad_crc": int(steer.bad_crc),
-                    "steer_cmd_bad_counter": int(steer.bad_counter),
-                    "steer_override": int(dbw.steering_override),
-                    "steer_fault": 0,
-                    "steering_wheel_torque_nm": OVERRIDE_TORQUE_NM if dbw.steering_override else 0.0,
-                },
-            ),
-            (
-                "VEH_MotionRpt",
-                {
-                    "speed_meas_mps": measured.speed_mps,
-                    "yaw_rate_meas_radps": measured.yaw_rate_radps,
-                    "speed_valid": 1,
-                    "yaw_rate_valid": 1,
-                },
-            ),
-            (
-                "VEH_LongRpt",
-                {
-                    "gear_rpt": int(dbw.gear),
-                    "park_brake_applied": int(dbw.park_brake_applied),
-                    "standstill": int(self._state.speed_mps == 0.0),
-                    "speed_echo_mps": self._echo_speed_mps,
-                    "brake_decel_echo_mps2": self._echo_decel_mps2,
-                    "long_cmd_timeout": int(dbw.is_timed_out("CTRL_LongCmd", now_ns)),
-                    "long_cmd_bad_crc": int(long.bad_crc),
-                    "long_cmd_bad_counter": int(long.bad_counter),
-                    "brake_override": int(dbw.brake_override),
-                    "long_fault": 0,
-                },
-            ),
-        ]
+        """All fast reports; the dictionaries are used again in the next tick."""
+        dbw = self._dbw
+        rejected = self._wire.rejected_count
+        sys, received = self._sys_rpt, self._received_sys
+        sys["vehicle_state"] = int(dbw.state)
+        sys["vehicle_reason"] = int(dbw.reason)
+        sys["driver_override"] = int(dbw.driver_override_latched)
+        sys["sys_cmd_timeout"] = int(dbw.is_timed_out("CTRL_SysCmd", now_ns))
+        sys["sys_cmd_bad_crc"] = int(received.bad_crc)
+        sys["sys_cmd_bad_counter"] = int(received.bad_counter)
+        sys["sys_cmd_rejected_count"] = rejected if rejected < REJECTED_COUNT_MAX else REJECTED_COUNT_MAX
+        steer, received = self._steer_rpt, self._received_steer
+        steer["road_wheel_angle_meas_rad"] = measured.road_wheel_angle_rad
+        steer["road_wheel_angle_echo_rad"] = self._echo_angle_rad
+        steer["steer_limiting_value"] = self._limited_value
+        steer["steer_limiting_rate"] = self._limited_rate
+        steer["steer_cmd_timeout"] = int(dbw.is_timed_out("CTRL_SteerCmd", now_ns))
+        steer["steer_cmd_bad_crc"] = int(received.bad_crc)
+        steer["steer_cmd_bad_counter"] = int(received.bad_counter)
+        steer["steer_override"] = int(dbw.steering_override)
+        steer["steering_wheel_torque_nm"] = OVERRIDE_TORQUE_NM if dbw.steering_override else 0.0
+        motion = self._motion_rpt
+        motion["speed_meas_mps"] = measured.speed_mps
+        motion["yaw_rate_meas_radps"] = measured.yaw_rate_radps
+        long, received = self._long_rpt, self._received_long
+        long["gear_rpt"] = int(dbw.gear)
+        long["park_brake_applied"] = int(dbw.park_brake_applied)
+        long["standstill"] = int(self._state.speed_mps == 0.0)
+        long["speed_echo_mps"] = self._echo_speed_mps
+        long["brake_decel_echo_mps2"] = self._echo_decel_mps2
+        long["long_cmd_timeout"] = int(dbw.is_timed_out("CTRL_LongCmd", now_ns))
+        long["long_cmd_bad_crc"] = int(received.bad_crc)
+        long["long_cmd_bad_counter"] = int(received.bad_counter)
+        long["brake_override"] = int(dbw.brake_override)
+        messages = [("VEH_SysRpt", sys), ("VEH_SteerRpt", steer), ("VEH_MotionRpt", motion), ("VEH_LongRpt", long)]
         if measured.pose_is_sent:
-            latency_ms, sigma_m = self._localiser
-            messages.append(
-                (
-                    "LOC_Position",
-                    {
-                        "position_x_m": measured.x_m,
-                        "position_y_m": measured.y_m,
-                        "position_quality": QUALITY_FIXED,
-                    },
-                )
-            )
-            messages.append(
-                (
-                    "LOC_Attitude",
-                    {
-                        "yaw_rad": measured.yaw_rad,
-                        "yaw_quality": QUALITY_FIXED,
-                        "pose_latency_ms": latency_ms,
-                        "position_sigma_m": sigma_m,
-                    },
-                )
-            )
+            position, attitude = self._position, self._attitude
+            position["position_x_m"] = measured.x_m
+            position["position_y_m"] = measured.y_m
+            attitude["yaw_rad"] = measured.yaw_rad
+            messages.append(("LOC_Position", position))
+            messages.append(("LOC_Attitude", attitude))
         return messages
 
     def _version(self) -> dict[str, Any]:
@@ -473,8 +453,9 @@ class Emulator:
         for name, values in messages:
             if faults.stops(name):
                 continue
-            faults.alter(name, values)
-            frame = faults.spoil(now_ns, name, self._wire.encode(name, values))
+            changed = dict(values)
+            faults.alter(name, changed)
+            frame = faults.spoil(now_ns, name, self._wire.encode(name, changed))
             if frame is not None:
                 frames.append(frame)
         return frames
@@ -487,7 +468,7 @@ class Emulator:
             if event.signal is not None and event.message is not None and event.signal not in signals[event.message]:
                 raise UserError(
                     f"scenario {scenario.name}: [[faults]] {event.kind}: message {event.message} has no signal "
-                    f"{event.signal!r}; it has {', '.join(signals[event.message])}"
+                    f"{event.signal!r}; it has {', '.join(sorted(signals[event.message]))}"
                 )
 
 

@@ -115,12 +115,9 @@ class FaultInjector:
         self._active: list[_Scheduled] = []
         self._late: list[tuple[int, Frame]] = []
         self.next_edge_ns = NEVER
+        self.is_quiet = True
+        """Whether no frame needs to be looked at."""
         self.begin("start", start_ns)
-
-    @property
-    def is_quiet(self) -> bool:
-        """Return whether no frame needs to be looked at."""
-        return not self._active and not self._late
 
     def begin(self, phase: str, now_ns: int) -> None:
         """Start the clock of the faults that count from this phase; only the first call for a phase matters."""
@@ -148,6 +145,7 @@ class FaultInjector:
             if now_ns >= fault.end_ns:
                 fault.begin_ns = fault.end_ns = NEVER
         self._active = [fault for fault in self._faults if fault.is_active]
+        self.is_quiet = not self._active and not self._late
         self._find_next_edge()
         return changed
 
@@ -196,4 +194,5 @@ class FaultInjector:
         """Frames that were kept back and are due, oldest first."""
         due = [frame for due_ns, frame in self._late if due_ns <= now_ns]
         self._late = [(due_ns, frame) for due_ns, frame in self._late if due_ns > now_ns]
+        self.is_quiet = not self._active and not self._late
         return due
