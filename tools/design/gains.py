@@ -1,0 +1,319 @@
+"""Gain schedules by direction and speed: observer from a Riccati equation, PID as fast as the margins allow.
+
+Everything is designed per metre of travel and stated for curvature, so that it hardly depends on the wheelbase. The
+observer's process noise is given per root metre and the pose's noise per sample: a slowly travelled metre is averaged
+over more poses, and the observer's gains depend on the speed. The PID is one pattern of poles per metre (`pid_gains`),
+scaled by a pace. At every speed of the grid the pace is the largest one, up to the law's own, with which the nominal
+car and every corner of the vehicle's box keep their poles in the D-region (`d_stable`) and a disk margin of at least
+`LEAST_DISK_MARGIN`. Of the observers tried, the one is taken that gives the nominal car the smallest modelled
+cross-track error (rms, worst speed of the grid).
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.data_files import Vehicle
+from sim.errors import UserError
+from tools.design import model
+from tools.design.model import Complexes, Floats, Row
+
+LAWS = ("car", "pid_ff")
+"""`car` observes and predicts; `pid_ff` takes each pose as it comes."""
+
+COLUMNS = Row._fields
+
+SPEED_GRID_MPS = (0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+
+POSITION_NOISE_M = 0.01
+HEADING_NOISE_RAD = math.radians(0.1)
+"""Noise of one pose, of the localisation that the design assumes."""
+
+DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
+"""What the car does by itself: noise of cross-track error (m), heading (rad) and curvature disturbance (1/m) per root
+metre of travel. The last stands for steering bias, steering gain and tyres, whose effect changes as the path bends."""
+
+OBSERVER_PACES = (1.0, 0.8, 0.65, 0.5, 0.4)
+"""Observers tried: process noise of `DISTURBANCE` with its poles moved by about these factors."""
+
+PREVIEW_S = 0.5
+"""The preview distance in seconds of travel."""
+
+FASTEST_PACE = {"car": 1.0, "pid_ff": 0.65}
+"""Largest pace of the PID: above it the pose's noise costs more than the quicker answer gains."""
+
+SLOWEST_PACE = 0.3
+"""Below it a start off the path would not be corrected within a leg."""
+
+LEAST_DISK_MARGIN = 0.34
+"""Of every car in the box: 1.4 times the steering gain, or 19 degrees of phase, whatever mixture of both."""
+
+SLOWEST_POLE_1PM = -0.08
+"""Every pole decays within 12 m of travel, the shorter leg."""
+
+LEAST_DAMPING = 0.1
+"""Of every car in the box; the nominal car has far more, and the disk margin mostly asks for more."""
+
+DEAD_BEAT_1PS = 40.0
+"""Poles that decay faster, within 2.5 cycles, belong to the delay chain and need no damping."""
+
+GAIN_SPREAD = 0.1
+"""Steering gain of the cars in the box, besides the wheelbase."""
+
+
+def pid_gains(pace: float) -> tuple[float, float, float]:
+    """PID gains kp (1/m^2), ki (1/m^3), kd (1/m) whose poles per metre are those of (2, 0.4, 2.5) times the pace."""
+    return 2.0 * pace**2, 0.4 * pace**3, 2.5 * pace
+
+
+def observer_noise(pace: float) -> tuple[float, float, float]:
+    """Process noise (m, rad, 1/m per root metre) of an observer whose poles are about `pace` times the first one's."""
+    e, heading, disturbance = DISTURBANCE
+    return e * math.sqrt(pace), heading * pace**1.5, disturbance * pace**2.5
+
+
+def corners(vehicle: Vehicle) -> list[model.Corner]:
+    """The cars to survive: the nominal one, then the corners of the box in lag, latency, steering gain and wheelbase.
+
+    Each has `model.LOOP_AGE_S` of latency besides its own. Mass and tyres do not enter: at walking speed the tyres
+    answer within a cycle or two, and what slip turns the car is the feedforward's and the disturbance's business.
+    """
+    age = model.LOOP_AGE_S / model.PERIOD_S
+    pose, command = vehicle.box["pose_latency_samples"], vehicle.box["command_latency_samples"]
+    own = vehicle.pose_latency_samples + vehicle.command_latency_samples
+    cars = [model.Corner("nominal car", vehicle.steering_lag_s, own + age, 1.0)]
+    spread = (1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD)
+    latencies = (pose[0] + command[0], pose[1] + command[1])
+    for lag, latency, gain, wheelbase in itertools.product(
+        _ends(vehicle.box["steering_lag_s"]), _ends(latencies), spread, _ends(vehicle.box["wheelbase_m"])
+    ):
+        name = f"lag {lag:g} s, latency {latency:g} samples, steering gain {gain:g}, wheelbase {wheelbase:g} m"
+        cars.append(model.Corner(name, lag, latency + age, gain * vehicle.wheelbase_m / wheelbase))
+    return cars
+
+
+def _ends(interval: tuple[float, float]) -> tuple[float, ...]:
+    return interval[:1] if interval[0] == interval[1] else interval
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# One row
+# --------------------------------------------------------------------------------------------------------------------
+
+
+def observer_model(
+    direction: float, speed_mps: float, noise: tuple[float, float, float]
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """The observer's F (3, 3), H (2, 3), process noise (3, 3) and measurement noise (2, 2) of one cycle."""
+    f, _ = model.motion(speed_mps, direction, 0.0)
+    ds = speed_mps * model.PERIOD_S
+    return (
+        f[:3, :3],
+        np.eye(2, 3),
+        np.diag([value * value * ds for value in noise]),
+        np.diag([POSITION_NOISE_M**2, HEADING_NOISE_RAD**2]),
+    )
+
+
+def observer_gains(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> Floats:
+    """Steady-state Kalman gains per cycle of (e, heading error, disturbance), shape (3, 2); zeros at standstill.
+
+    noise: process noise of the three per root metre of travel.
+    """
+    from scipy.linalg import solve_discrete_are  # noqa: PLC0415  (heavy, and only the design needs it)
+
+    if speed_mps == 0.0:
+        return np.zeros((3, 2))
+    f, h, q, r = observer_model(direction, speed_mps, noise)
+    # In units of the measurement's noise: the solver is accurate where numbers are alike.
+    unit = np.array([POSITION_NOISE_M, HEADING_NOISE_RAD, HEADING_NOISE_RAD])
+    covariance = solve_discrete_are(
+        (f * unit / unit[:, None]).T, h.T, q / np.outer(unit, unit), r / np.outer(unit[:2], unit[:2])
+    ) * np.outer(unit, unit)
+    return np.asarray(covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r))
+
+
+def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer: Floats) -> Row:
+    """A row of the gain table; `observer` (3, 2) is not used by a law that takes each pose as it comes."""
+    correction = observer if law == "car" else np.eye(3, 2)
+    kp, ki, kd = pid_gains(pid_pace)
+    l_ee, l_ep, l_pe, l_pp, l_de, l_dp = (float(value) for value in correction.reshape(-1))
+    return Row(direction, speed_mps, PREVIEW_S * speed_mps, kp, ki, kd, l_ee, l_ep, l_pe, l_pp, l_de, l_dp)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The criteria
+# --------------------------------------------------------------------------------------------------------------------
+
+
+def frequencies(count: int = 240) -> Complexes:
+    """Points on the upper half of the unit circle, denser towards 1; at all speeds the crossings lie well inside."""
+    omega = np.geomspace(1e-3, 0.999 * math.pi / model.PERIOD_S, count)
+    return np.asarray(np.exp(1j * omega * model.PERIOD_S))
+
+
+def disk_margin(loop: Complexes) -> Floats:
+    """Balanced disk margin of loops over the last axis: any gain and phase in the disk keeps a stable loop stable.
+
+    2 / max |S - T|, as python-control's `disk_margins` with skew 0 (Seiler, Packard, Gahinet 2020).
+    """
+    return np.asarray(2.0 * np.min(np.abs((1.0 + loop) / (1.0 - loop)), axis=-1))
+
+
+def d_stable(matrix: Floats, speed_mps: float) -> bool:
+    """Whether all poles of a closed loop lie in the D-region: fast enough per metre of travel, and damped."""
+    poles = model.poles_1pm(matrix, speed_mps)
+    if float(poles.real.max()) > SLOWEST_POLE_1PM:
+        return False
+    slow = poles[poles.real > -DEAD_BEAT_1PS / speed_mps]
+    return bool(np.all(-slow.real >= LEAST_DAMPING * np.abs(slow)))
+
+
+def modelled_error_m(row: Row, nominal: model.Nominal, car: model.Corner, predicts: bool) -> float:
+    """Stationary rms of the cross-track error of a stable closed loop, m.
+
+    Driven by the noise of the poses and by `DISTURBANCE`; by integration of the spectra.
+    """
+    theta = np.geomspace(1e-4 * row.speed_mps, math.pi, 400)
+    z = np.exp(1j * theta)
+    plant = model.car_response(car, row.speed_mps, row.direction, z)
+    law = model.controller_response(row, nominal, z, predicts)
+    f, _, process, measurement = observer_model(row.direction, row.speed_mps, DISTURBANCE)
+    drift = np.linalg.solve(z[:, None, None] * np.eye(3) - f, np.sqrt(process)[None])[:, :2]
+    # All five sources as the pose would show them without feedback.
+    pose = np.concatenate([drift, np.broadcast_to(np.sqrt(measurement), (len(z), 2, 2))], axis=2)
+    command = np.einsum("zi,zij->zj", law, pose) / (1.0 - np.sum(law * plant, axis=1))[:, None]
+    error = plant[:, :1] * command
+    error[:, :3] += drift[:, 0]
+    power = np.sum(np.abs(error) ** 2, axis=1)
+    area = float(np.sum(0.5 * (power[1:] + power[:-1]) * np.diff(theta)) + power[0] * theta[0])
+    return math.sqrt(area / math.pi)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The choice
+# --------------------------------------------------------------------------------------------------------------------
+
+
+class Schedule(NamedTuple):
+    """What was chosen for a law: the observer's pace, the PID's pace at each speed, and the modelled error."""
+
+    observer_pace: float
+    pid_pace: tuple[float, ...]
+    cross_track_rms_m: float
+
+
+def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
+    """Gain tables of every law for a vehicle: rows in the order of `COLUMNS`, directions +1 and -1 over the speed grid.
+
+    Deterministic. Raises UserError where no gains survive the vehicle's box, naming the dimension to narrow.
+    """
+    tables: dict[str, list[tuple[float, ...]]] = {}
+    for law in LAWS:
+        schedule = choose(vehicle, law)
+        noise = observer_noise(schedule.observer_pace)
+        tables[law] = [
+            tuple(row_of(law, direction, speed, pace, observer_gains(direction, speed, noise)))
+            for direction in (1.0, -1.0)
+            for speed, pace in zip(SPEED_GRID_MPS, schedule.pid_pace, strict=True)
+        ]
+    return tables
+
+
+def choose(vehicle: Vehicle, law: str) -> Schedule:
+    """The best schedule of a vehicle and law, by the criterion of this module."""
+    cars = corners(vehicle)
+    nominal = model.nominal_of(vehicle)
+    best: Schedule | None = None
+    for observer_pace in OBSERVER_PACES if law == "car" else OBSERVER_PACES[:1]:
+        schedule = _schedule(nominal, law, cars, observer_pace)
+        if schedule is None:
+            continue
+        if best is not None and schedule.cross_track_rms_m >= best.cross_track_rms_m:
+            break  # slower observers only lose from here on
+        best = schedule
+    if best is None:
+        raise UserError(_why_not(vehicle, nominal, law))
+    return best
+
+
+def _schedule(nominal: model.Nominal, law: str, cars: list[model.Corner], observer_pace: float) -> Schedule | None:
+    """The schedule with one observer; None where some speed has no gains that survive."""
+    noise = observer_noise(observer_pace)
+    fastest = FASTEST_PACE[law]
+    paces: list[float] = []
+    worst = 0.0
+    z = frequencies()
+    # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
+    for speed in reversed(SPEED_GRID_MPS[1:]):
+        observer = observer_gains(1.0, speed, noise)
+
+        def survives(pace: float, speed: float = speed, observer: Floats = observer) -> bool:
+            return _survives(row_of(law, 1.0, speed, pace, observer), nominal, cars, z, law == "car")
+
+        pace = _largest(survives, SLOWEST_PACE, fastest)
+        if pace is None:
+            return None
+        paces.append(pace)
+        chosen = row_of(law, 1.0, speed, pace, observer)
+        worst = max(worst, modelled_error_m(chosen, nominal, cars[0], law == "car"))
+    paces.append(paces[-1])  # standstill
+    return Schedule(observer_pace, tuple(reversed(paces)), worst)
+
+
+def _survives(row: Row, nominal: model.Nominal, cars: list[model.Corner], z: Complexes, predicts: bool) -> bool:
+    loops = model.loop_response(row, nominal, cars, z, predicts)
+    if float(disk_margin(loops).min()) < LEAST_DISK_MARGIN:
+        return False
+    return all(d_stable(model.closed_loop(row, nominal, car, predicts), row.speed_mps) for car in cars)
+
+
+def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int = 7) -> float | None:
+    """Largest value from low to high for which a property holds that is lost on the way up; None where low lacks it."""
+    if holds(high):
+        return high
+    if not holds(low):
+        return None
+    for _ in range(steps):
+        middle = 0.5 * (low + high)
+        if holds(middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
+    """One line that names the dimension of the box which keeps the softest gains from surviving."""
+    z = frequencies()
+    noise = observer_noise(OBSERVER_PACES[-1])
+    speed = SPEED_GRID_MPS[-1]
+    row = row_of(law, 1.0, speed, SLOWEST_PACE, observer_gains(1.0, speed, noise))
+    cars = corners(vehicle)
+    margins = disk_margin(model.loop_response(row, nominal, cars, z, law == "car"))
+    for index, car in enumerate(cars):
+        if not d_stable(model.closed_loop(row, nominal, car, law == "car"), speed):
+            margins[index] = 0.0
+    worst = cars[int(np.argmin(margins))]
+    # Put one dimension of the worst car back to nominal at a time: the one that helps most is to blame.
+    home = cars[0]
+    trials = {
+        "steering_lag_s": worst._replace(steering_lag_s=home.steering_lag_s),
+        "pose_latency_samples and command_latency_samples": worst._replace(latency_samples=home.latency_samples),
+        "wheelbase_m": worst._replace(gain=1.0),
+    }
+    gained = {
+        name: float(disk_margin(model.loop_response(row, nominal, [car], z, law == "car"))[0])
+        for name, car in trials.items()
+    }
+    blame = max(gained, key=lambda name: gained[name])
+    keys = blame.split(" and ")
+    low, high = (sum(vehicle.box[key][end] for key in keys) for end in (0, 1))
+    own = sum(getattr(vehicle, key) for key in keys)
+    return (
+        f"vehicle {vehicle.name}: {blame}: no gains of law {law} are stable with margin from {low:g} to {high:g} around"
+        f" {own:g} (worst: {worst.name} at {speed:g} m/s); narrow low..high or make the car quicker"
+    )
