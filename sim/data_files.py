@@ -76,7 +76,9 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
     except UnicodeDecodeError as error:
         raise UserError(f"{path}: not a text file in UTF-8 (byte {error.start})") from None
     except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{path}: not valid TOML: {error}") from None
+        raise UserError(f"{path}: not valid TOML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise UserError(f"{path}: not valid TOML: nested too deeply") from None
 
 
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -108,9 +110,14 @@ def _first_mistake(error: ValidationError, model: type[BaseModel]) -> str:
         text = f"{key}: {what}" if key else what
     else:
         what = mistake["msg"]
-        text = f"{key} = {mistake['input']!r}: {what[0].lower()}{what[1:]}"
+        text = f"{key} = {_shown(mistake['input'])}: {what[0].lower()}{what[1:]}"
     more = len(mistakes) - 1
     return text + (f" (and {more} more)" if more else "")
+
+
+def _shown(value: object, most: int = 60) -> str:
+    text = repr(value)
+    return text if len(text) <= most else text[:most] + "..."
 
 
 def _as_in_the_file(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, list[str]]:
@@ -451,6 +458,13 @@ class Course(BaseModel):
         sign = 1.0 if side == "left" else -1.0
         return tuple((cone.x_m, sign * cone.y_m) for cone in self.cones)
 
+    def cone_names(self, side: Side = "left") -> tuple[str, ...]:
+        """Names of the cones in the file's order; in the mirror image left is right, in the names too."""
+        if side == "left":
+            return tuple(cone.name for cone in self.cones)
+        words = {"left": "right", "right": "left"}
+        return tuple("-".join(words.get(word, word) for word in cone.name.split("-")) for cone in self.cones)
+
     def start_pose(self, vehicle: Vehicle, side: Side = "left") -> Pose:
         """Pose of the rear-axle centre at the start, which is also that of the return."""
         if isinstance(self.start, StartAtBumper):
@@ -508,7 +522,7 @@ def _to_draw(value: Any) -> Any:
     if isinstance(value, list):
         if len(value) == 2 and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
             return (float(value[0]), float(value[1]))
-        raise ValueError(f"{value!r} must be a number or [low, high]")
+        raise ValueError(f"{_shown(value)} must be a number or [low, high]")
     return value
 
 

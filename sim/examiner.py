@@ -87,7 +87,7 @@ class Examiner:
         self._side: Side = side
         self._outline = outline_of(vehicle)
         self._cones = course.cones_xy(side)
-        self._names = [cone.name for cone in course.cones]
+        self._names = course.cone_names(side)
         self._start = course.start_pose(vehicle, side)
         self._stop = course.stop_pose(vehicle, side)
         self._runs: list[_Run] = []
