@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -155,6 +156,16 @@ def test_a_run_without_motion_has_no_legs() -> None:
     truth = straight_run()
     still = truth._replace(speed_mps=np.zeros_like(truth.speed_mps))
     assert split_legs(still, straight_path(), PREVIEW) == []
+
+
+def test_each_change_of_direction_begins_a_leg_and_a_stop_on_the_way_does_not() -> None:
+    truth = straight_run()
+    speed = truth.speed_mps.copy()
+    speed[200:220] = 0.0  # a stop on the way
+    speed[-5:-1] = 0.1  # and forward again in the end
+    legs = split_legs(truth._replace(speed_mps=speed), straight_path(), PREVIEW)
+    assert [leg.direction for leg in legs] == [FORWARD, REVERSE, FORWARD]
+    assert all(a.rows.stop <= b.rows.start + 1 for a, b in pairwise(legs))
 
 
 def test_a_run_that_ends_in_the_first_leg_has_one() -> None:

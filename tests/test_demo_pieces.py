@@ -352,14 +352,14 @@ def hear(station: Station, side: CanSide, now_ns: int, mode: int, *, leg: int = 
     station.hear(now_ns, *side.encode("CTRL_SysCmd", values))
 
 
-def test_start_is_pressed_for_a_moment_each_time_the_controller_becomes_ready() -> None:
+def test_start_is_pressed_for_a_moment_each_time_the_controller_becomes_ready_until_it_has_driven() -> None:
     station, controller = Station(DBC), CanSide(DBC, nodes=("CTRL",))
     pressed = []
-    for t, mode in [(0, 0), (10, 1), (200, 1), (400, 1), (500, 0), (510, 1), (520, 2), (530, 2)]:
+    for t, mode in [(0, 0), (10, 1), (200, 1), (400, 1), (500, 0), (510, 1), (520, 2), (530, 1), (540, 0), (550, 1)]:
         hear(station, controller, t * MS, mode)
         station.press_start_when_ready(t * MS)
         pressed.append(station.start)
-    assert pressed == [False, True, True, False, False, True, False, False]
+    assert pressed == [False, True, True, False, False, True, False, False, False, False]
 
 
 def test_a_frame_with_a_wrong_crc_says_nothing_to_the_station() -> None:

@@ -19,6 +19,8 @@ from sim.errors import UserError
 
 Floats = npt.NDArray[np.float64]
 FORWARD, REVERSE = "forward", "reverse"
+STOP_M = 0.10
+"""The last of a leg, where the brake ends the motion; its deceleration is a figure of its own."""
 
 
 class PathTable(NamedTuple):
@@ -156,20 +158,21 @@ def project(path: PathTable, x_m: Floats, y_m: Floats, yaw_rad: Floats, *, chunk
 
 
 def split_legs(truth: Truth, path: PathTable, preview: Preview | None) -> list[Leg]:
-    """Cut a run into its legs: forward motion, then motion in reverse; a leg that was not driven is left out."""
+    """Cut a run into its legs: a leg ends where the car next moves in the other direction; a test has two."""
+    moving = np.flatnonzero(truth.speed_mps)
+    sign = np.sign(truth.speed_mps[moving])
     legs: list[Leg] = []
-    for direction, sigma in ((FORWARD, 1.0), (REVERSE, -1.0)):
-        moving = np.flatnonzero(sigma * truth.speed_mps > 0.0)
-        if not len(moving):
-            continue
-        rows = slice(int(moving[0]), min(int(moving[-1]) + 2, len(truth.t_s)))
+    for part in np.split(moving, np.flatnonzero(np.diff(sign)) + 1) if len(moving) else []:
+        sigma = float(np.sign(truth.speed_mps[part[0]]))
+        direction = FORWARD if sigma > 0.0 else REVERSE
+        rows = slice(int(part[0]), min(int(part[-1]) + 2, len(truth.t_s)))
         on_path = project(path, truth.x_m[rows], truth.y_m[rows], truth.yaw_rad[rows])
         preview_m: Floats | float = 0.0
         if preview is not None:
             speed = np.abs(truth.speed_mps[rows])
             preview_m = np.interp(speed, preview.speed_mps[direction], preview.preview_m[direction])
         preview_error = on_path.cross_track_error_m + sigma * preview_m * np.sin(on_path.heading_error_rad)
-        steering_rows = slice(legs[-1].rows.stop if legs else 0, rows.stop)
+        steering_rows = slice(min(legs[-1].rows.stop, rows.start) if legs else 0, rows.stop)
         legs.append(Leg(direction, rows, steering_rows, on_path, preview_error))
     if legs:
         legs[-1] = legs[-1]._replace(steering_rows=slice(legs[-1].steering_rows.start, len(truth.t_s)))
@@ -190,6 +193,8 @@ def leg_figures(leg: Leg, truth: Truth, path: PathTable) -> dict[str, Any]:
     rows, error = leg.rows, leg.on_path.cross_track_error_m
     beyond = leg.on_path.station_m[-1] - path.length_m if leg.direction == FORWARD else -leg.on_path.station_m[-1]
     steering = leg.steering_rows
+    station = leg.on_path.station_m
+    stopping = np.abs(station - station[-1]) <= STOP_M
     return {
         "direction": leg.direction,
         "max_cross_track_m": float(np.max(np.abs(error))),
@@ -202,7 +207,8 @@ def leg_figures(leg: Leg, truth: Truth, path: PathTable) -> dict[str, Any]:
         "max_road_wheel_rate_radps": float(np.max(np.abs(truth.road_wheel_rate_radps[steering]))),
         "max_road_wheel_rate_cmd_radps": float(np.max(np.abs(command_rate(truth, steering)), initial=0.0)),
         "max_speed_mps": float(np.max(np.abs(truth.speed_mps[rows]))),
-        "max_accel_x_mps2": float(np.max(np.abs(truth.accel_x_mps2[rows]))),
+        "max_accel_x_mps2": float(np.max(np.abs(truth.accel_x_mps2[rows][~stopping]), initial=0.0)),
+        "max_stop_decel_mps2": float(np.max(np.abs(truth.accel_x_mps2[rows][stopping]))),
         "max_accel_y_mps2": float(np.max(np.abs(truth.accel_y_mps2[rows]))),
         "min_clearance_m": float(np.min(truth.min_clearance_m[rows])),
         "duration_s": float(truth.t_s[rows][-1] - truth.t_s[rows][0]),

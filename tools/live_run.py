@@ -18,7 +18,7 @@ from firmware_py.reasons import TEXT
 from sim.errors import UserError
 from tools.bus_log import BusLog
 from tools.figures import PathTable, project
-from tools.operator_station import ACTIVE, FAULT, MANUAL, Station, exchange
+from tools.operator_station import ACTIVE, COMPLETE, FAULT, MANUAL, NO_REASON, Station, exchange
 from tools.processes import STATUS_USER_ERROR, Child
 from tools.progress import Moment, Progress
 
@@ -29,7 +29,7 @@ START_LIMIT_S = 30.0
 """From start of the processes to a car that drives; slow machines need seconds to load Python alone."""
 BLOCKED_LIMIT_S = 4.0
 """A reason not to start that does not go away by itself is waited for no longer than this."""
-PASSING_REASONS = {"WaitingForReports", "WaitingForOperator", "PoseSettling", "VehicleNotReady", "None"}
+PASSING_REASONS = {"WaitingForReports", "WaitingForOperator", "PoseSettling", "VehicleNotReady", NO_REASON}
 DRIVE_LIMIT_S = 180.0
 STANDSTILL_LIMIT_S = 15.0
 FAULT_LIMIT_S = 20.0
@@ -245,7 +245,9 @@ class LiveRun:
         station = self._station
         if station.is_silent("CTRL_SysCmd", time.monotonic_ns()):
             return "starting" if not station.mode else "ending"
-        return station.leg if station.mode == ACTIVE else f"{station.mode}: {station.reason}"
+        if station.mode == ACTIVE or station.reason == COMPLETE:
+            return station.leg
+        return station.mode if station.reason == NO_REASON else f"{station.mode}: {station.reason}"
 
     def _moment(self, leg: str) -> Moment:
         report = self._emulator.latest

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 DBC = Path(__file__).resolve().parent.parent / "dbc" / "parking.dbc"
 MANUAL, READY, ACTIVE, FAULT = "Manual", "Ready", "Active", "Fault"
 COMPLETE = "Complete"
+NO_REASON = "None"
 CLEAR_HOLD_S = 0.5
 START_HOLD_S = 0.3
 POLL_S = 0.005
@@ -87,6 +88,7 @@ class Station:
         self._period_ns = description.heartbeat_ns
         self._due_ns = 0
         self._ready_ns = 0
+        self._has_driven = False
 
     def heartbeat(self, now_ns: int) -> tuple[int, bytes] | None:
         """Return the frame that is due now, or None; skipped periods are not made up for."""
@@ -147,8 +149,9 @@ class Station:
         return f"{TEXT.get(int(values['control_reason']), 'unknown reason')} ({self.reason})"
 
     def press_start_when_ready(self, now_ns: int) -> None:
-        """Press start for a moment each time the controller becomes Ready."""
-        if self.mode != READY:
+        """Press start for a moment each time the controller becomes Ready, until it has driven: one start, one test."""
+        self._has_driven |= self.mode == ACTIVE
+        if self.mode != READY or self._has_driven:
             self._ready_ns = 0
         elif not self._ready_ns:
             self._ready_ns = now_ns

@@ -23,6 +23,8 @@ from matplotlib.patches import Circle, Polygon  # noqa: E402
 COLOUR = {FORWARD: "tab:blue", "reverse": "tab:red"}
 OUTLINE_STEP_M = 0.25
 LABEL_ROOM_M = 0.6
+MAX_LEGS = 4
+"""A test has two; one that went wrong may have any number."""
 DPI = 130
 
 
@@ -38,9 +40,9 @@ def swept_body(
     title: str,
 ) -> None:
     """Draw the body's outline along both legs among the cones, with the path of the rear axle, to scale."""
-    outline = outline_of(vehicle)
+    outline, legs = outline_of(vehicle), legs[:MAX_LEGS]
     figure, rows = plt.subplots(
-        max(1, len(legs)), 1, figsize=(13, 1.1 + 4.6 * max(1, len(legs))), squeeze=False, layout="constrained"
+        max(1, len(legs)), 1, figsize=(13, 0.8 + 4.1 * max(1, len(legs))), squeeze=False, layout="constrained"
     )
     for axes, leg in zip(rows[:, 0], legs, strict=False):
         _swept_leg(axes, outline, course, side, truth, path, leg)
@@ -53,11 +55,11 @@ def swept_body(
 
 def _course(axes: Axes, course: Course, side: Side) -> np.ndarray[Any, Any]:
     cones = np.array(course.cones_xy(side))
-    for (x, y), cone in zip(cones, course.cones, strict=True):
+    for (x, y), name in zip(cones, course.cone_names(side), strict=True):
         axes.add_patch(Circle((x, y), course.cone_radius_m, color="darkorange", zorder=5))
-        below = y < 0
+        below = y < 0.0 or (y == 0.0 and side == "left")  # away from the car
         axes.annotate(
-            cone.name, (x, y), (0, -9 if below else 9), textcoords="offset points", ha="center",
+            name, (x, y), (0, -9 if below else 9), textcoords="offset points", ha="center",
             va="top" if below else "bottom", fontsize=8, zorder=6,
         )  # fmt: skip
     axes.set_aspect("equal")
@@ -97,13 +99,13 @@ def _swept_leg(
         bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.8},
     )  # fmt: skip
     axes.set_title(
-        f"{leg.direction}: nearest to a cone's axis at {course.cones[cone].name} "
+        f"{leg.direction}: nearest to a cone's axis at {course.cone_names(side)[cone]} "
         f"(a cone counts as touched within {course.cone_radius_m:.2f} m of its axis)", fontsize=10,
     )  # fmt: skip
     axes.autoscale_view()
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, cones[:, 1].min() - LABEL_ROOM_M), max(high, cones[:, 1].max() + LABEL_ROOM_M))
-    axes.legend(loc="lower right", ncols=2, fontsize=8)
+    axes.legend(loc="lower right" if side == "left" else "upper right", ncols=2, fontsize=8)
 
 
 def _nearest_point(corners: np.ndarray[Any, Any], point: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -121,7 +123,7 @@ def signals(
     """Draw speed, steering with its limits, errors and clearance of both legs over the path's station."""
     figure, rows = plt.subplots(6, 1, figsize=(12, 17), sharex=True, layout="constrained")
     speed, angle, rate, error, heading, clearance = rows
-    for leg in legs:
+    for leg in legs[:MAX_LEGS]:
         colour, name = COLOUR[leg.direction], leg.direction
         station = leg.on_path.station_m
         steering = leg.steering_rows
@@ -132,8 +134,15 @@ def signals(
         speed.plot(station, truth.speed_mps[leg.rows], color=colour, label=name)
         angle.plot(steering_station, truth.road_wheel_angle_cmd_rad[steering], **thin, label=f"{name}, command")
         angle.plot(steering_station, truth.road_wheel_angle_rad[steering], color=colour, lw=1.2, label=f"{name}, true")
-        rate.plot(steering_station, command_rate(truth, steering), **thin, label=f"{name}, command")
-        rate.plot(steering_station, truth.road_wheel_rate_radps[steering], color=colour, lw=1.0, label=f"{name}, true")
+        rate.plot(steering_station, command_rate(truth, steering), **thin | {"alpha": 0.3}, label=f"{name}, command")
+        rate.plot(
+            steering_station,
+            truth.road_wheel_rate_radps[steering],
+            color=colour,
+            lw=1.2,
+            zorder=3,
+            label=f"{name}, true",
+        )
         figures = leg_figures(leg, truth, path)
         error.plot(station, 1e3 * leg.preview_error_m, **thin, label=f"{name}, at the preview point")
         error.plot(
