@@ -104,7 +104,7 @@ def _first_mistake(error: ValidationError, model: type[BaseModel]) -> str:
     elif mistake["type"] == "union_tag_not_found":
         text = f"{key}.rule: missing"
     elif mistake["type"] == "union_tag_invalid":
-        text = f"{key}.rule = {mistake['ctx']['tag']!r}: must be {mistake['ctx']['expected_tags']}"
+        text = f"{key}.rule = {_shown(mistake['ctx']['tag'])}: must be {mistake['ctx']['expected_tags']}"
     elif mistake["type"] == "value_error":
         what = str(mistake["ctx"]["error"])
         text = f"{key}: {what}" if key else what
@@ -118,6 +118,11 @@ def _first_mistake(error: ValidationError, model: type[BaseModel]) -> str:
 def _shown(value: object, most: int = 60) -> str:
     text = repr(value)
     return text if len(text) <= most else text[:most] + "..."
+
+
+def _key(text: str) -> str:
+    """Return a key as it can stand in one line."""
+    return text if text.isprintable() and len(text) <= 60 else _shown(text)
 
 
 def _as_in_the_file(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[str, list[str]]:
@@ -134,7 +139,7 @@ def _as_in_the_file(model: type[BaseModel], location: tuple[int | str, ...]) -> 
         if tagged and len(here) > 1:
             here = tagged
             continue
-        key += f".{part}" if key else part
+        key += f".{_key(part)}" if key else _key(part)
         field_info = here[0].model_fields.get(part) if len(here) == 1 else None
         here = [] if field_info is None else _models_in(field_info.annotation)
     return key, siblings
@@ -244,7 +249,7 @@ def check_parameters(values: Mapping[str, float], where: str) -> None:
     """Raise UserError where a key is no vehicle parameter or a value is outside the parameter's range."""
     for key, value in values.items():
         if key not in PARAMETERS:
-            raise UserError(f"{where}{key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
+            raise UserError(f"{where}{_key(key)}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
         _check_range(key, value, where)
 
 
@@ -294,7 +299,7 @@ def load_vehicle(name_or_path: str | Path, overlay: Mapping[str, float] | None =
     where = f"{path}: parameters."
     for key in file.parameters:
         if key not in PARAMETERS:
-            raise UserError(f"{where}{key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
+            raise UserError(f"{where}{_key(key)}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
     for key, parameter in PARAMETERS.items():
         if key not in file.parameters:
             raise UserError(
@@ -303,7 +308,7 @@ def load_vehicle(name_or_path: str | Path, overlay: Mapping[str, float] | None =
             )
         entry = file.parameters[key]
         if entry.unit != parameter.unit:
-            raise UserError(f'{where}{key}.unit = "{entry.unit}": must be "{parameter.unit}"')
+            raise UserError(f"{where}{key}.unit = {_shown(entry.unit)}: must be {parameter.unit!r}")
         for part in ("nominal", "low", "high"):
             _check_range(f"{key}.{part}", getattr(entry, part), where)
         if not entry.low <= entry.nominal <= entry.high:
@@ -516,14 +521,18 @@ Draw = tuple[float, float]
 """A value that each run draws evenly from (low, high); a plain number in the file is (number, number)."""
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
+
+
 def _to_draw(value: Any) -> Any:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if _is_number(value):
         return (float(value), float(value))
-    if isinstance(value, list):
-        if len(value) == 2 and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value):
-            return (float(value[0]), float(value[1]))
-        raise ValueError(f"{_shown(value)} must be a number or [low, high]")
-    return value
+    if isinstance(value, list) and len(value) == 2 and all(_is_number(end) for end in value):
+        return (float(value[0]), float(value[1]))
+    if isinstance(value, tuple):
+        return value
+    raise ValueError(f"{_shown(value)} must be a number or [low, high]")
 
 
 def _within(minimum: float, maximum: float) -> Callable[[Draw], Draw]:
@@ -627,7 +636,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
             raise UserError(f"{path}: plant.unknown.{key} = [{low!r}, {high!r}]: the lower end comes first")
     for key in scenario.plant.corners:
         if key not in PARAMETERS:
-            raise UserError(f"{path}: plant.corners.{key}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
+            raise UserError(f"{path}: plant.corners.{_key(key)}: unknown key; a vehicle has {', '.join(PARAMETERS)}")
     return scenario
 
 

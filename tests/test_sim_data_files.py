@@ -5,15 +5,20 @@ from __future__ import annotations
 import hashlib
 import math
 import random
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from sim.data_files import (
     FOLDERS,
     PARAMETERS,
+    PlantDeviation,
     Pose,
+    Sensors,
+    StartOffset,
     check_fit,
     find_file,
     load_course,
@@ -23,6 +28,7 @@ from sim.data_files import (
     true_vehicle,
 )
 from sim.errors import UserError
+from sim.faults import FaultEvent, FaultKind
 
 PAPER = FOLDERS["vehicle"] / "paper.toml"
 OHIO = FOLDERS["course"] / "ohio.toml"
@@ -278,7 +284,7 @@ MASS = "mass_kg = { nominal = 3000.0, low = 2100.0, high = 3900.0"
             "mass_kg = { nominal = 3000.0, low = 5.0, high = 3900.0",
             "parameters.mass_kg.low = 5.0: must be from 50 to 60000 kg",
         ),
-        (MASS + ', unit = "kg"', MASS + ', unit = "t"', 'parameters.mass_kg.unit = "t": must be "kg"'),
+        (MASS + ', unit = "kg"', MASS + ', unit = "t"', "parameters.mass_kg.unit = 't': must be 'kg'"),
         (MASS + ', unit = "kg"', MASS, "parameters.mass_kg.unit: missing"),
         (
             "nominal = 0.50, low = 0.50, high = 0.50",
@@ -557,3 +563,93 @@ def test_a_start_offset_is_in_the_cars_own_frame() -> None:
     assert max(start.x_m for start in starts) > 1.045
     assert max(abs(start.yaw_rad - math.pi / 2) for start in starts) == pytest.approx(math.radians(1.0), rel=0.02)
     assert load_scenario("car").start.apply(Pose(1.0, 2.0, 0.5), rng) == Pose(1.0, 2.0, 0.5)
+
+
+# ----------------------------------------------------------------------------------------------- whatever is written
+
+
+ODD_VALUES = (
+    '"text"',
+    '""',
+    "true",
+    "-1",
+    "0",
+    "1e400",
+    "-1e300",
+    "nan",
+    "inf",
+    "9" * 400,
+    "[]",
+    "[1, 2]",
+    "[[1], {}]",
+    "{}",
+    "{ a = 1 }",
+    "2026-01-01",
+    '"""a\nb"""',
+    "[" + "1, " * 500 + "]",
+    '1\n"a\\nb" = 2',
+)
+
+
+def complaint(kind: str, path: Path) -> str:
+    """What the loader says of a file, nothing if it takes it; anything but a UserError passes through."""
+    try:
+        LOADERS[kind](path)
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("kind", LOADERS)
+def test_an_odd_value_anywhere_is_one_line_or_accepted(kind: str, tmp_path: Path) -> None:
+    """Every value of a shipped file becomes a third of the odd ones in turn; every line is left out, doubled, cut."""
+    lines = {"vehicle": PAPER, "course": OHIO, "scenario": CAR}[kind].read_text().splitlines()
+    path = tmp_path / "odd.toml"
+    refused = 0
+    for number, line in enumerate(lines):
+        key, separator, value = line.partition(" = ")
+        texts = (
+            [f"{key} = {odd}" for odd in ODD_VALUES[number % 3 :: 3]] if separator and not line.startswith("#") else []
+        )
+        if value.startswith("{"):
+            texts = [
+                line.replace(part, f"{part.partition('=')[0]}= {ODD_VALUES[number % len(ODD_VALUES)]}")
+                for part in value.strip("{} ").split(", ")[:4]
+            ]
+        for changed in [*texts, "", f"{line}\n{line}", line[: len(line) // 2]]:
+            path.write_text("\n".join([*lines[:number], changed, *lines[number + 1 :]]))
+            text = complaint(kind, path)
+            refused += bool(text)
+            assert "\n" not in text
+            assert not text or text.startswith(f"{path}: ")
+            assert len(text) < 1000
+    assert refused > len(lines)
+
+
+def test_deep_nesting_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "deep.toml"
+    path.write_text("a = " + "[" * 100_000)
+    with pytest.raises(UserError) as error:
+        load_scenario(path)
+    assert one_line(error) == f"{path}: not valid TOML: nested too deeply"
+
+
+def test_the_guide_to_scenario_files_names_every_key_and_no_other() -> None:
+    guide = (FOLDERS["scenario"] / "README.md").read_text()
+    named = set(re.findall(r"^\| `([a-z_]+)` \|", guide, re.MULTILINE))
+    tables = (PlantDeviation, Sensors, StartOffset, FaultEvent)
+    assert named == {key for table in tables for key in table.model_fields} | {"vehicle_overlay"}
+    for kind in get_args(FaultKind):
+        assert f"`{kind}`" in guide
+    for name in shipped_names("scenario"):
+        assert f"`{name}`" in guide
+
+
+def test_the_guides_example_loads(tmp_path: Path) -> None:
+    guide = (FOLDERS["scenario"] / "README.md").read_text()
+    path = tmp_path / "mine.toml"
+    path.write_text(guide.partition("```toml\n")[2].partition("```")[0])
+    scenario = load_scenario(path)
+    assert scenario.faults
+    assert scenario.vehicle_overlay
+    assert scenario.plant.unknown

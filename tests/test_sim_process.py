@@ -293,7 +293,7 @@ def test_a_broken_file_leaves_nothing_behind(tmp_path: Path) -> None:
     broken.write_text(text.replace('unit = "kg"', 'unit = "g"'))
     out = tmp_path / "out"
     assert (
-        refused("--vehicle", str(broken), "--out", str(out)) == f'{broken}: parameters.mass_kg.unit = "g": must be "kg"'
+        refused("--vehicle", str(broken), "--out", str(out)) == f"{broken}: parameters.mass_kg.unit = 'g': must be 'kg'"
     )
     assert not out.exists()
 
