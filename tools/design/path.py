@@ -56,13 +56,22 @@ def sample(fit: FitResult, step_m: float = GRID_M) -> Path:
     width = rest / (arc[piece + 1] - arc[piece]) / pieces
     for _ in range(6):  # Newton on the arc length within the piece; the integrand is nearly constant
         at = start[:, None] + width[:, None] * node[None, :]
-        covered = (geometry(fit, np.broadcast_to(segment[piece][:, None], at.shape), at).speed_m * weight).sum(axis=1) * width
+        covered = (geometry(fit, np.broadcast_to(segment[piece][:, None], at.shape), at).speed_m * weight).sum(
+            axis=1
+        ) * width
         width += (rest - covered) / geometry(fit, segment[piece], start + width).speed_m
     lambda_ = start + width
     # The ends are pinned: no rounding of the inversion may move them.
     lambda_[0], lambda_[-1] = 0.0, 1.0
     points = geometry(fit, segment[piece], lambda_)
-    return Path(station, points.x_m, points.y_m, points.yaw_rad, points.curvature_1pm, points.curvature_slope_1pm2)
+    return Path(
+        np.asarray(station, dtype=np.float64),
+        points.x_m,
+        points.y_m,
+        points.yaw_rad,
+        points.curvature_1pm,
+        points.curvature_slope_1pm2,
+    )
 
 
 def coarse(fit: FitResult, per_segment: int) -> Geometry:

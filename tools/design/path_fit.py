@@ -1,20 +1,24 @@
-"""The paper's segmented polynomial fit (its eq. 1 to 10) as an equality-constrained least-squares problem, solved exactly.
+"""The paper's segmented polynomial fit (its eq. 1 to 10): equality-constrained least squares, solved exactly.
 
-Each segment i is x_i(lambda), y_i(lambda), polynomials of order p on [0, 1]. Neighbours share the derivatives up to order
-q. The paper equates derivatives in raw lambda, which bends the parameter where segments differ in length; here the k-th
-derivative is divided by h^k, h being the segment's length in the waypoints' parameter, so that what is continuous are the
-derivatives along the path. The raw variant and free ends stay available for comparison with the paper.
+Each segment i is x_i(lambda), y_i(lambda), polynomials of order p on [0, 1]. Neighbours share the derivatives up to
+order q. The paper equates derivatives in raw lambda, which bends the parameter where segments differ in length; here
+the k-th derivative is divided by h^k, h being the segment's length in the waypoints' parameter, so that what is
+continuous are the derivatives along the path. The raw variant and free ends stay available for comparison with the
+paper.
 
 The minimiser is found in the null space of the constraints (no iteration, no penalty): constraint residuals are at the
 level of rounding.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.errors import UserError
 from tools.design.waypoints import DenseWaypoints, Floats
+
+Integers = NDArray[np.integer[Any]]
 
 
 class FitResult(NamedTuple):
@@ -32,7 +36,7 @@ class FitResult(NamedTuple):
 
 
 def derivative_row(order: int, lambda_: float, p: int) -> Floats:
-    """Row that gives the `order`-th derivative at `lambda_` from p + 1 coefficients in rising powers; shape (p + 1,)."""
+    """Row that gives the `order`-th derivative at `lambda_` from coefficients in rising powers; shape (p + 1,)."""
     row = np.zeros(p + 1)
     for power in range(order, p + 1):
         factor = 1.0
@@ -53,10 +57,10 @@ def fit_path(
 ) -> FitResult:
     """Fit m polynomial segments of order `p` with derivatives continuous up to order `q` to the waypoints.
 
-    waypoints: m segments of n waypoints each. start, stop: shape (r, 2), values of the derivatives of order 0 to r - 1 of
-    (x, y) by the waypoints' parameter that are pinned at the ends (position, tangent, second derivative); None leaves
-    the end free, as printed in the paper. length_scaled: False equates raw derivatives by lambda (the paper's eq. 5).
-    Raises UserError where the conditions leave nothing to fit or contradict each other.
+    waypoints: m segments of n waypoints each. start, stop: shape (r, 2), values of the derivatives of order 0 to r - 1
+    of (x, y) by the waypoints' parameter that are pinned at the ends (position, tangent, second derivative); None
+    leaves the end free, as printed in the paper. length_scaled: False equates raw derivatives by lambda (the paper's
+    eq. 5). Raises UserError where the conditions leave nothing to fit or contradict each other.
     """
     m, n = waypoints.x_m.shape
     unknowns = m * (p + 1)
@@ -86,7 +90,9 @@ def fit_path(
     gamma = np.array(rows).reshape(len(rows), unknowns)
     target = np.array(values).reshape(len(rows), 2)
     if len(rows) >= unknowns:
-        raise UserError(f"path fit: {len(rows)} conditions on {unknowns} coefficients; raise the order p = {p} or lower q = {q}")
+        raise UserError(
+            f"path fit: {len(rows)} conditions on {unknowns} coefficients; raise the order p = {p} or lower q = {q}"
+        )
 
     share = (waypoints.parameter_m - waypoints.parameter_m[:, :1]) / length_m[:, None]
     phi = np.zeros((m * n, unknowns))
@@ -123,13 +129,13 @@ def _least_squares(phi: Floats, measured: Floats, gamma: Floats, target: Floats)
 
 
 def pins(x_m: float, y_m: float, yaw_rad: float, curvature_1pm: float = 0.0) -> Floats:
-    """Pin for `fit_path` of waypoints whose parameter is x: position, heading and curvature at one end; shape (3, 2)."""
+    """Pin for `fit_path` of waypoints over x: position, heading and curvature at one end; shape (3, 2)."""
     slope = np.tan(yaw_rad)
     bend = curvature_1pm * (1.0 + slope * slope) ** 1.5
     return np.array([[x_m, y_m], [1.0, slope], [0.0, bend]])
 
 
-def evaluate(fit: FitResult, segment: Floats, lambda_: Floats, order: int) -> Floats:
+def evaluate(fit: FitResult, segment: Integers, lambda_: Floats, order: int) -> Floats:
     """Derivative of the given order by lambda of (x, y) at `lambda_` of `segment` (index array); shape (..., 2)."""
     p = fit.coefficients.shape[1] - 1
     result = np.zeros((*np.shape(lambda_), 2))
@@ -143,10 +149,7 @@ def evaluate(fit: FitResult, segment: Floats, lambda_: Floats, order: int) -> Fl
 
 
 class Geometry(NamedTuple):
-    """Points of a path, arrays of one shape: position (m), heading (rad), curvature (1/m), its slope by arc length (1/m^2)
-
-    and the derivative of arc length by lambda (m).
-    """
+    """Points of a path, arrays of one shape; curvature's slope is by arc length, `speed_m` is arc length by lambda."""
 
     x_m: Floats
     y_m: Floats
@@ -156,7 +159,7 @@ class Geometry(NamedTuple):
     speed_m: Floats
 
 
-def geometry(fit: FitResult, segment: Floats, lambda_: Floats) -> Geometry:
+def geometry(fit: FitResult, segment: Integers, lambda_: Floats) -> Geometry:
     """Position, heading, curvature (paper, eq. 10) and the slope of the curvature, all from exact derivatives."""
     r0, r1, r2, r3 = (evaluate(fit, segment, lambda_, order) for order in range(4))
     speed = np.sqrt(r1[..., 0] * r1[..., 0] + r1[..., 1] * r1[..., 1])

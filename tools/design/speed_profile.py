@@ -1,8 +1,8 @@
 """Speed by station: from standstill to standstill within limits of speed, acceleration, jerk and steering rate.
 
 The unknown is b = v^2 on the path's grid, in which acceleration b'/2 is linear. The jerk v b''/2 is not, but its limit
-|b''| <= 2 j / sqrt(b) may be replaced by the tangent at a former solution: sqrt's reciprocal is convex, so the tangent lies
-below it, every solution of the linear programme keeps the true limit, and repeating it only makes the ride faster.
+|b''| <= 2 j / sqrt(b) may be replaced by the tangent at a former solution: sqrt's reciprocal is convex, so the tangent
+lies below it, every solution of the linear programme keeps the true limit, and repeating it only makes the ride faster.
 """
 
 import math
@@ -56,17 +56,15 @@ def plan_speed(path: Path, wheelbase_m: float, limits: SpeedLimits, direction: i
 
     path: the forward path; direction -1 rides it backwards, stations then count from the forward leg's end. every: the
     optimisation works on every so-many-th station (0.04 m at the usual grid) and is interpolated between.
-    The firmware needs a speed above zero to leave a station at all, so speeds below the floor are raised to it; the stop
-    itself is the controller's. Raises UserError where the limits force a speed below the floor on the way.
+    The firmware needs a speed above zero to leave a station at all, so speeds below the floor are raised to it; the
+    stop itself is the controller's. Raises UserError where the limits force a speed below the floor on the way.
     """
-    from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (heavy, and only the design needs it)
-
     cap = station_limit(path, wheelbase_m, limits)
     if cap.min() < limits.floor_mps:
         where = float(path.station_m[int(cap.argmin())])
         raise UserError(
             f"speed profile: at station {where:.2f} m the steering rate limit {limits.road_wheel_rate_radps:.3g} rad/s"
-            f" (from max_road_wheel_rate_radps) allows {cap.min():.3f} m/s, less than the floor of {limits.floor_mps:g} m/s"
+            f" (from max_road_wheel_rate_radps) allows {cap.min():.3f} m/s, below the floor of {limits.floor_mps:g} m/s"
         )
     if direction < 0:
         cap = cap[::-1]
@@ -77,12 +75,14 @@ def plan_speed(path: Path, wheelbase_m: float, limits: SpeedLimits, direction: i
     reach = path.length_m / cells
     coarse_cap = np.array([cap[np.abs(path.station_m - s) <= reach].min() for s in station])
     b = _optimise(coarse_cap, reach, limits)
-    slope = np.gradient(b, reach)
-    slope[0] = slope[-1] = 0.0
-    curve = CubicHermiteSpline(station, b, slope)
-    energy = np.clip(curve(path.station_m), 0.0, cap * cap)
+    # Acceleration is linear between the middles of the cells, so the jerk stays what the programme limited.
+    middle = 0.5 * (station[1:] + station[:-1])
+    planned = np.interp(path.station_m, middle, 0.5 * np.diff(b) / reach)
+    energy = np.concatenate([[0.0], np.cumsum((planned[1:] + planned[:-1]) * path.step_m)])
+    energy -= energy[-1] * path.station_m / path.length_m
+    energy = np.clip(energy, 0.0, cap * cap)
     speed = np.maximum(np.sqrt(energy), limits.floor_mps)
-    accel = np.clip(0.5 * curve(path.station_m, 1), -limits.accel_x_mps2, limits.accel_x_mps2)
+    accel = np.clip(planned, -limits.accel_x_mps2, limits.accel_x_mps2)
     accel[speed <= limits.floor_mps] = 0.0
     duration = float(np.sum(path.step_m / (0.5 * (speed[1:] + speed[:-1]))))
     return SpeedProfile(path.station_m, speed, accel, duration)

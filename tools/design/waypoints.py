@@ -6,6 +6,7 @@ segments. All lengths in m, angles in rad, in the course frame (x ahead, y left)
 """
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ def check_waypoints(waypoints: Waypoints) -> None:
                 f" (x = {x[index - 1]:g} m); give them in the order of forward travel"
             )
     borders = (x[0], *split, x[-1])
-    for before, after in zip(borders, borders[1:], strict=False):
+    for before, after in pairwise(borders):
         if not after > before:
             raise UserError(
                 f"waypoints: segments are cut at x = {', '.join(f'{s:g}' for s in split)} m; the cuts must increase"

@@ -1,0 +1,115 @@
+"""`parkctl design`: make, check or rewrite the controller's tables from vehicle and course files."""
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from sim.data_files import Course, Vehicle, load_course, load_scenario, load_vehicle
+from sim.errors import UserError
+
+DONE, DIFFERENT = 0, 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `parkctl design`."""
+    parser.add_argument("--vehicle", metavar="NAME|FILE", help="the car (default: paper; with --update/--check: all)")
+    parser.add_argument("--course", metavar="NAME|FILE", help="the course (default: ohio; with --update/--check: all)")
+    parser.add_argument("--scenario", metavar="NAME|FILE", help="take this scenario's vehicle overlay into the design")
+    parser.add_argument("--tables", type=Path, metavar="DIR", help="write the tables into this folder, replacing it")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--update", action="store_true", help="rewrite the tables that come with the project")
+    what.add_argument("--check", action="store_true", help="make them again and compare; status 1 where they differ")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures for machines")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run `parkctl design`; return the exit status."""
+    if options.update or options.check:
+        if options.tables is not None or options.scenario is not None:
+            raise UserError("--update and --check are for the shipped tables; leave out --tables and --scenario")
+        return _shipped(options)
+    overlay = load_scenario(options.scenario).vehicle_overlay if options.scenario else None
+    vehicle = load_vehicle(options.vehicle or "paper", overlay)
+    course = load_course(options.course or "ohio")
+    figures = _design(vehicle, course, options.tables)
+    _write_json(options.json, figures)
+    return DONE if figures["certificate"]["all_d_stable"] else DIFFERENT
+
+
+def _shipped(options: argparse.Namespace) -> int:
+    from tools.design import tables  # noqa: PLC0415 -- scipy
+
+    pairs = tables.shipped_pairs(options.vehicle, options.course)
+    if not pairs:
+        known = ", ".join(f"{vehicle} on {course}" for vehicle, course in tables.SHIPPED)
+        raise UserError(
+            f"no shipped tables for {options.vehicle or 'any'} on {options.course or 'any'}; there are: {known}"
+        )
+    status = DONE
+    all_figures = []
+    for vehicle, course in pairs:
+        folder = tables.SHIPPED_FOLDER / tables.folder_name(vehicle, course)
+        if options.update:
+            all_figures.append(_design(vehicle, course, folder))
+            continue
+        stale = tables.stale_inputs(folder, vehicle, course)
+        report = tables.run_design(vehicle, course)
+        found = [f"stale: {what} has changed since" for what in stale]
+        found += tables.differences(tables.table_texts(report), folder)
+        for line in found:
+            print(f"{folder.name}: {line}")
+        if found:
+            status = DIFFERENT
+            print(f"{folder.name}: differs; run `parkctl design --update`")
+        else:
+            print(f"{folder.name}: fresh, and the same when made again")
+        all_figures.append(tables.as_json(report, None))
+    _write_json(options.json, {"designs": all_figures})
+    return status
+
+
+def _design(vehicle: Vehicle, course: Course, folder: Path | None) -> dict[str, Any]:
+    """Design, certify, show, and write where a folder is given; nothing is written where the certificate fails."""
+    from tools.design import tables  # noqa: PLC0415 -- scipy
+    from tools.design.certificate import certify  # noqa: PLC0415 -- python-control
+
+    report = tables.run_design(vehicle, course)
+    certificate = certify(vehicle, report.gains)
+    figures = tables.as_json(report, certificate)
+    _show(figures)
+    if not certificate.all_d_stable:
+        raise UserError(
+            f"vehicle {vehicle.name}: the design is not stable in its whole box; worst: {certificate.worst}"
+        )
+    if folder is not None:
+        tables.write_tables(report, folder)
+        print(f"tables written to {folder}")
+    return figures
+
+
+def _show(figures: dict[str, Any]) -> None:
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title=f"design: {figures['vehicle']} on {figures['course']}", title_justify="left")
+    table.add_column("what")
+    table.add_column("value", justify="right")
+    for part in ("path", "certificate"):
+        for name, value in figures.get(part, {}).items():
+            shown = ", ".join(f"{v:.2f}" for v in value) if isinstance(value, list) else value
+            table.add_row(name, f"{shown:.4g}" if isinstance(shown, float) else str(shown))
+    Console().print(table)
+
+
+def _write_json(file: Path | None, figures: dict[str, Any]) -> None:
+    """Write the figures; the file appears whole or not at all."""
+    if file is None:
+        return
+    temporary = file.with_name(file.name + ".part")
+    try:
+        temporary.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        os.replace(temporary, file)
+    except OSError as error:
+        raise UserError(f"--json {file}: cannot be written ({error.strerror})") from error
