@@ -34,6 +34,7 @@ REJECTED_COUNT_MAX = 1023
 MAX_TRUTH_ROWS = 360_000
 """An hour of truth; what is older goes."""
 
+_ROUNDING_RAD = 1.0e-9
 _MISSED_TARGET_RAD = 1.0e-4  # farther than this from its target when the next one comes: the rate limit has cut it
 
 
@@ -247,7 +248,7 @@ class Emulator:
             _, angle = self._pending_steer.popleft()
             if self._dbw.follows_steering:
                 self._limited_rate = int(abs(self._steer_target_rad - self._steer.demand_rad) > _MISSED_TARGET_RAD)
-                self._limited_value = int(abs(angle) > self._steering.max_angle_rad)
+                self._limited_value = int(abs(angle) > self._steering.max_angle_rad + _ROUNDING_RAD)
                 self._steer_target_rad = steering_target(self._steering, angle)
         while self._pending_long and self._pending_long[0][0] <= now_ns:
             self._long = self._pending_long.popleft()[1]
@@ -273,7 +274,7 @@ class Emulator:
         plant, steering = self._plant, self._steering
         state, steer, decel = self._state, self._steer, self._decel_mps2
         is_frozen = not self._faults.is_quiet and self._faults.steering_is_frozen
-        target = steer.demand_rad if is_frozen else self._steer_target_rad
+        target = self._steer_target_rad
         speed_target, decel_target = self._speed_target_mps, self._decel_target_mps2
         drive_lag, brake_lag, bias = self._drive_lag_s, self._brake_lag_s, steering.bias_rad
         remember = self._history.append
@@ -282,7 +283,8 @@ class Emulator:
         t_ns = self._t_ns
         for index in range(1, count + 1):
             wheel_before = steer.wheel_rad
-            steer = step_steering(steering, steer, target, h)
+            if not is_frozen:
+                steer = step_steering(steering, steer, target, h)
             before = speed
             speed, decel = step_speed(drive_lag, brake_lag, speed, decel, speed_target, decel_target, h)
             state = step(plant, state, speed, steer.wheel_rad + bias, h)

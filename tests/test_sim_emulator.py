@@ -145,8 +145,11 @@ def test_the_limit_bits() -> None:
         bench.tick(1)
     assert bench.seen["VEH_SteerRpt"]["steer_limiting_rate"] == 1
     assert bench.seen["VEH_SteerRpt"]["steer_limiting_value"] == 0
-    bench.steer["road_wheel_angle_cmd_rad"] = 0.7
+    bench.steer["road_wheel_angle_cmd_rad"] = 0.5
     bench.tick(100)
+    assert bench.seen["VEH_SteerRpt"]["steer_limiting_value"] == 0
+    bench.steer["road_wheel_angle_cmd_rad"] = 0.7
+    bench.tick(3)
     assert bench.seen["VEH_SteerRpt"]["steer_limiting_value"] == 1
     assert bench.seen["VEH_SteerRpt"]["road_wheel_angle_meas_rad"] == pytest.approx(0.5)
     assert max(row.road_wheel_rate_radps for row in bench.emulator.truth) <= 0.59 * (1 + 1e-9)

@@ -169,7 +169,8 @@ def test_the_button_in_the_car_acts_at_its_instant_to_the_nanosecond() -> None:
 
 
 def test_a_frozen_rack_does_not_follow_and_comes_back() -> None:
-    bench = Bench(world({"kind": "steering_frozen", "after": "active", "at_s": 1.0, "duration_s": 0.5})).until_active()
+    fault = {"kind": "steering_frozen", "after": "active", "at_s": 1.0, "duration_s": 0.5}
+    bench = Bench(scenario(faults=[fault])).until_active()  # with the rack's lag
     bench.go(0.4, 0.2)
     angles, commands = [], []
     for i in range(150):
@@ -180,7 +181,7 @@ def test_a_frozen_rack_does_not_follow_and_comes_back() -> None:
     still = [i for i in range(5, 150) if angles[i] == angles[i - 1]]
     assert 48 <= len(still) <= 51
     assert still == list(range(still[0], still[-1] + 1))
-    assert abs(angles[-1] - commands[-2]) < 0.01
+    assert abs(angles[-1] - commands[-2]) < 0.08  # lag and latency of a moving command
 
 
 # ------------------------------------------------------------------------------------------------------- the schedule
