@@ -22,7 +22,10 @@ from tools.design import model
 from tools.design.model import Complexes, Floats, Row
 
 LAWS = ("car", "pid_ff")
-"""`car` observes and predicts; `pid_ff` takes each pose as it comes."""
+"""As in the names of their tables; `pid_ff` takes each pose as it comes."""
+
+PREDICTING_LAWS = ("car",)
+"""Laws that observe, and predict to the instant at which the command acts."""
 
 COLUMNS = Row._fields
 
@@ -55,10 +58,13 @@ SLOWEST_POLE_1PM = -0.08
 """Every pole decays within 12 m of travel, the shorter leg."""
 
 LEAST_DAMPING = 0.1
-"""Of every car in the box; the nominal car has far more, and the disk margin mostly asks for more."""
+"""Of every pole of every car in the box; the nominal car has far more, and the disk margin mostly asks for more."""
 
-DEAD_BEAT_1PS = 40.0
-"""Poles that decay faster, within 2.5 cycles, belong to the delay chain and need no damping."""
+BLEND_RESERVE = 1.2
+"""The rows' damping over the least one: what is blended between two rows has a little less than they."""
+
+QUICK_1PS = 10.0
+"""Poles that decay faster, within 0.1 s, belong to delay chain and lag and need no damping."""
 
 GAIN_SPREAD = 0.1
 """Steering gain of the cars in the box, besides the wheelbase."""
@@ -73,6 +79,12 @@ def observer_noise(pace: float) -> tuple[float, float, float]:
     """Process noise (m, rad, 1/m per root metre) of an observer whose poles are about `pace` times the first one's."""
     e, heading, disturbance = DISTURBANCE
     return e * math.sqrt(pace), heading * pace**1.5, disturbance * pace**2.5
+
+
+def checked_speeds(vehicle: Vehicle) -> tuple[float, ...]:
+    """Speeds of the grid that the car can have, without standstill; in the rows beyond, it never is."""
+    reached = [speed for speed in SPEED_GRID_MPS[:-1] if speed < vehicle.max_speed_mps]
+    return SPEED_GRID_MPS[1 : len(reached) + 1]
 
 
 def corners(vehicle: Vehicle) -> list[model.Corner]:
@@ -138,7 +150,7 @@ def observer_gains(direction: float, speed_mps: float, noise: tuple[float, float
 
 def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer: Floats) -> Row:
     """A row of the gain table; `observer` (3, 2) is not used by a law that takes each pose as it comes."""
-    correction = observer if law == "car" else np.eye(3, 2)
+    correction = observer if law in PREDICTING_LAWS else np.eye(3, 2)
     kp, ki, kd = pid_gains(pid_pace)
     l_ee, l_ep, l_pe, l_pp, l_de, l_dp = (float(value) for value in correction.reshape(-1))
     return Row(direction, speed_mps, PREVIEW_S * speed_mps, kp, ki, kd, l_ee, l_ep, l_pe, l_pp, l_de, l_dp)
@@ -149,9 +161,13 @@ def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observ
 # --------------------------------------------------------------------------------------------------------------------
 
 
-def frequencies(count: int = 240) -> Complexes:
-    """Points on the upper half of the unit circle, denser towards 1; at all speeds the crossings lie well inside."""
-    omega = np.geomspace(1e-3, 0.999 * math.pi / model.PERIOD_S, count)
+def frequencies(speed_mps: float, count: int = 200) -> Floats:
+    """Angular frequencies, rad/s, by even ratios from one period in 300 m of travel to half the rate of cycles."""
+    return np.geomspace(0.02 * speed_mps, 0.999 * math.pi / model.PERIOD_S, count)
+
+
+def on_circle(omega: Floats) -> Complexes:
+    """The points z of angular frequencies in rad/s."""
     return np.asarray(np.exp(1j * omega * model.PERIOD_S))
 
 
@@ -163,13 +179,13 @@ def disk_margin(loop: Complexes) -> Floats:
     return np.asarray(2.0 * np.min(np.abs((1.0 + loop) / (1.0 - loop)), axis=-1))
 
 
-def d_stable(matrix: Floats, speed_mps: float) -> bool:
+def d_stable(matrix: Floats, speed_mps: float, least_damping: float = LEAST_DAMPING) -> bool:
     """Whether all poles of a closed loop lie in the D-region: fast enough per metre of travel, and damped."""
     poles = model.poles_1pm(matrix, speed_mps)
     if float(poles.real.max()) > SLOWEST_POLE_1PM:
         return False
-    slow = poles[poles.real > -DEAD_BEAT_1PS / speed_mps]
-    return bool(np.all(-slow.real >= LEAST_DAMPING * np.abs(slow)))
+    slow = poles[poles.real > -QUICK_1PS / speed_mps]
+    return bool(np.all(-slow.real >= least_damping * np.abs(slow)))
 
 
 def modelled_error_m(row: Row, nominal: model.Nominal, car: model.Corner, predicts: bool) -> float:
@@ -225,50 +241,53 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
 
 def choose(vehicle: Vehicle, law: str) -> Schedule:
     """The best schedule of a vehicle and law, by the criterion of this module."""
-    cars = corners(vehicle)
-    nominal = model.nominal_of(vehicle)
     best: Schedule | None = None
-    for observer_pace in OBSERVER_PACES if law == "car" else OBSERVER_PACES[:1]:
-        schedule = _schedule(nominal, law, cars, observer_pace)
+    for observer_pace in OBSERVER_PACES if law in PREDICTING_LAWS else OBSERVER_PACES[:1]:
+        schedule = _schedule(vehicle, law, observer_pace)
         if schedule is None:
             continue
         if best is not None and schedule.cross_track_rms_m >= best.cross_track_rms_m:
             break  # slower observers only lose from here on
         best = schedule
     if best is None:
-        raise UserError(_why_not(vehicle, nominal, law))
+        raise UserError(_why_not(vehicle, model.nominal_of(vehicle), law))
     return best
 
 
-def _schedule(nominal: model.Nominal, law: str, cars: list[model.Corner], observer_pace: float) -> Schedule | None:
+def _schedule(vehicle: Vehicle, law: str, observer_pace: float) -> Schedule | None:
     """The schedule with one observer; None where some speed has no gains that survive."""
+    cars = corners(vehicle)
+    nominal = model.nominal_of(vehicle)
+    checked = checked_speeds(vehicle)
     noise = observer_noise(observer_pace)
     fastest = FASTEST_PACE[law]
     paces: list[float] = []
     worst = 0.0
-    z = frequencies()
     # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
-    for speed in reversed(SPEED_GRID_MPS[1:]):
+    for speed in reversed(checked):
         observer = observer_gains(1.0, speed, noise)
 
         def survives(pace: float, speed: float = speed, observer: Floats = observer) -> bool:
-            return _survives(row_of(law, 1.0, speed, pace, observer), nominal, cars, z, law == "car")
+            return _survives(row_of(law, 1.0, speed, pace, observer), nominal, cars, law in PREDICTING_LAWS)
 
         pace = _largest(survives, SLOWEST_PACE, fastest)
         if pace is None:
             return None
         paces.append(pace)
         chosen = row_of(law, 1.0, speed, pace, observer)
-        worst = max(worst, modelled_error_m(chosen, nominal, cars[0], law == "car"))
-    paces.append(paces[-1])  # standstill
-    return Schedule(observer_pace, tuple(reversed(paces)), worst)
+        worst = max(worst, modelled_error_m(chosen, nominal, cars[0], law in PREDICTING_LAWS))
+    beyond = len(SPEED_GRID_MPS) - 1 - len(checked)
+    by_speed = (paces[-1], *reversed(paces), *(paces[0],) * beyond)
+    return Schedule(observer_pace, by_speed, worst)
 
 
-def _survives(row: Row, nominal: model.Nominal, cars: list[model.Corner], z: Complexes, predicts: bool) -> bool:
+def _survives(row: Row, nominal: model.Nominal, cars: list[model.Corner], predicts: bool) -> bool:
+    z = on_circle(frequencies(row.speed_mps))
     loops = model.loop_response(row, nominal, cars, z, predicts)
     if float(disk_margin(loops).min()) < LEAST_DISK_MARGIN:
         return False
-    return all(d_stable(model.closed_loop(row, nominal, car, predicts), row.speed_mps) for car in cars)
+    least_damping = BLEND_RESERVE * LEAST_DAMPING
+    return all(d_stable(model.closed_loop(row, nominal, car, predicts), row.speed_mps, least_damping) for car in cars)
 
 
 def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int = 7) -> float | None:
@@ -288,32 +307,29 @@ def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int
 
 def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
     """One line that names the dimension of the box which keeps the softest gains from surviving."""
-    z = frequencies()
-    noise = observer_noise(OBSERVER_PACES[-1])
-    speed = SPEED_GRID_MPS[-1]
-    row = row_of(law, 1.0, speed, SLOWEST_PACE, observer_gains(1.0, speed, noise))
+    speed = checked_speeds(vehicle)[-1]
+    row = row_of(law, 1.0, speed, SLOWEST_PACE, observer_gains(1.0, speed, observer_noise(OBSERVER_PACES[-1])))
+    z = on_circle(frequencies(speed))
+
+    def margin(car: model.Corner) -> float:
+        if not d_stable(model.closed_loop(row, nominal, car, law in PREDICTING_LAWS), speed):
+            return 0.0
+        return float(disk_margin(model.loop_response(row, nominal, [car], z, law in PREDICTING_LAWS))[0])
+
     cars = corners(vehicle)
-    margins = disk_margin(model.loop_response(row, nominal, cars, z, law == "car"))
-    for index, car in enumerate(cars):
-        if not d_stable(model.closed_loop(row, nominal, car, law == "car"), speed):
-            margins[index] = 0.0
-    worst = cars[int(np.argmin(margins))]
-    # Put one dimension of the worst car back to nominal at a time: the one that helps most is to blame.
-    home = cars[0]
+    worst = min(cars, key=margin)
+    # The dimension that helps most when it alone is taken back, to the nominal car or, if that is the worst, to none.
+    home = model.Corner("", 0.0, 0.0, 1.0) if worst is cars[0] else cars[0]
     trials = {
-        "steering_lag_s": worst._replace(steering_lag_s=home.steering_lag_s),
-        "pose_latency_samples and command_latency_samples": worst._replace(latency_samples=home.latency_samples),
-        "wheelbase_m": worst._replace(gain=1.0),
+        ("steering_lag_s",): worst._replace(steering_lag_s=home.steering_lag_s),
+        ("pose_latency_samples", "command_latency_samples"): worst._replace(latency_samples=home.latency_samples),
+        ("wheelbase_m",): worst._replace(gain=1.0),
     }
-    gained = {
-        name: float(disk_margin(model.loop_response(row, nominal, [car], z, law == "car"))[0])
-        for name, car in trials.items()
-    }
-    blame = max(gained, key=lambda name: gained[name])
-    keys = blame.split(" and ")
-    low, high = (sum(vehicle.box[key][end] for key in keys) for end in (0, 1))
-    own = sum(getattr(vehicle, key) for key in keys)
+    keys = max(trials, key=lambda names: margin(trials[names]))
+    own, low, high = (
+        sum(values) for values in zip(*((getattr(vehicle, key), *vehicle.box[key]) for key in keys), strict=True)
+    )
     return (
-        f"vehicle {vehicle.name}: {blame}: no gains of law {law} are stable with margin from {low:g} to {high:g} around"
-        f" {own:g} (worst: {worst.name} at {speed:g} m/s); narrow low..high or make the car quicker"
+        f"vehicle {vehicle.name}: {' + '.join(keys)} = {own:g} ({low:g} to {high:g}): no gains of law {law} keep a disk"
+        f" margin of {LEAST_DISK_MARGIN:g} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
     )

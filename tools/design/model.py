@@ -298,6 +298,11 @@ def loop_response(
     )
 
 
+def is_stable(matrix: Floats) -> bool:
+    """Whether the states of a cycle's matrix decay."""
+    return bool(np.abs(np.linalg.eigvals(matrix)).max() < 1.0)
+
+
 def poles_1pm(matrix: Floats, speed_mps: float) -> Complexes:
     """Eigenvalues of a cycle's matrix as poles per metre of travel, ln(z) / ds; dead-beat ones are left out."""
     z = np.linalg.eigvals(matrix).astype(np.complex128)
