@@ -67,7 +67,7 @@ def begin() -> State:
         supervisor=supervisor.begin(),
         manoeuvre=manoeuvre.begin(),
         observer=observer.begin(0.0, 0.0),
-        speed=speed.SpeedState(reference_station_m=0.0, stopping=0),
+        speed=speed.begin(0.0),
         integral_m2=0.0,
         limited=0,
         sent_angles_rad=(0.0,) * predictor.QUEUE_LENGTH,
@@ -102,9 +102,9 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     integral_m2 = state.integral_m2
     if direction != manoeuvre.direction_of(state.manoeuvre.leg):
         observed = observer.turn_round(leg, observed)
-        reference = speed.SpeedState(reference_station_m=observed.path.station_m, stopping=0)
+        reference = speed.begin(observed.path.station_m)
     if not active and not stopping_on_path:
-        reference = speed.SpeedState(reference_station_m=observed.path.station_m, stopping=0)
+        reference = speed.begin(observed.path.station_m)
         integral_m2 = 0.0
 
     # Where the car is, and where it will be when this cycle's command acts.

@@ -11,6 +11,13 @@ STATION_GAIN_1PS = 0.8
 REFERENCE_LEAD_M = 0.10
 """The reference waits when it is this far ahead: a car that does not follow is not chased."""
 
+ACCEL_LIMIT_MPS2 = 0.45
+JERK_LIMIT_MPS3 = 1.0
+"""What the command may ask of the drive: below 0.05 g whatever the profile and the error to it say, and eased in."""
+
+LEAST_DRIVE_LAG_S = 0.05
+"""A drive quicker than this is treated as if it had this lag: the command then leads the speed a little less."""
+
 CREEP_MPS = 0.04
 """Least speed asked for on the way to the stop: below the profile's floor, above what odometry can resolve."""
 
@@ -23,10 +30,16 @@ HOLD_DECEL_MPS2 = 1.5
 
 
 class SpeedState(NamedTuple):
-    """The moving reference's station, and whether the stop at the end of the leg has begun."""
+    """The moving reference's station, the acceleration asked for last, and whether the stop has begun."""
 
     reference_station_m: float
+    accel_mps2: float
     stopping: int
+
+
+def begin(station_m: float) -> SpeedState:
+    """Return the state at standstill at a station."""
+    return SpeedState(reference_station_m=station_m, accel_mps2=0.0, stopping=0)
 
 
 class SpeedCommand(NamedTuple):
@@ -46,15 +59,15 @@ def follow(
 ) -> tuple[SpeedState, SpeedCommand]:
     """Return the next reference and the command that follows it.
 
-    The drive answers a speed command with a first-order lag, so the command leads the reference by lag times
-    acceleration. Once the remaining distance is what the brake needs, the stop begins and is not taken back.
+    The drive answers a speed command with a first-order lag, so the command leads the speed by lag times acceleration.
+    Once the remaining distance is what the brake needs, the stop begins and is not taken back.
     """
     remaining_m = leg.length_m - station_now_m
     speed_mps = max(travel_speed_mps, 0.0)
     braking_m = speed_mps * (car.brake_lag_s + 0.5 * dt_s) + 0.5 * speed_mps * speed_mps / STOP_DECEL_MPS2
     if state.stopping != 0 or remaining_m <= braking_m:
         return (
-            SpeedState(reference_station_m=leg.length_m, stopping=1),
+            SpeedState(reference_station_m=leg.length_m, accel_mps2=0.0, stopping=1),
             SpeedCommand(travel_speed_mps=0.0, brake_decel_mps2=STOP_DECEL_MPS2),
         )
     reference = locate(leg, state.reference_station_m)
@@ -65,8 +78,13 @@ def follow(
         + car.drive_lag_s * reference.accel_mps2
         + STATION_GAIN_1PS * (state.reference_station_m - station_now_m)
     )
-    command_mps = max(min(wanted_mps, car.max_speed_mps), CREEP_MPS)
+    lag_s = max(car.drive_lag_s, LEAST_DRIVE_LAG_S)
+    eased_mps2 = JERK_LIMIT_MPS3 * dt_s
+    accel_mps2 = (wanted_mps - speed_mps) / lag_s
+    accel_mps2 = max(min(accel_mps2, state.accel_mps2 + eased_mps2), state.accel_mps2 - eased_mps2)
+    accel_mps2 = max(min(accel_mps2, ACCEL_LIMIT_MPS2), -ACCEL_LIMIT_MPS2)
+    command_mps = max(min(speed_mps + lag_s * accel_mps2, car.max_speed_mps), CREEP_MPS)
     return (
-        SpeedState(reference_station_m=station_m, stopping=0),
+        SpeedState(reference_station_m=station_m, accel_mps2=accel_mps2, stopping=0),
         SpeedCommand(travel_speed_mps=command_mps, brake_decel_mps2=0.0),
     )
