@@ -269,25 +269,25 @@ def test_the_operators_keys_start_stop_and_clear(tmp_path: Path) -> None:
             started.append(operate)
 
             def wait_for(text: str, limit_s: float = 30.0) -> None:
+                """Wait for a text in the newest line."""
                 end = time.monotonic() + limit_s
-                while text not in (tmp_path / "said.txt").read_text():
+                while text not in (tmp_path / "said.txt").read_text().rstrip("\n").rpartition("\n")[2]:
                     assert time.monotonic() < end, f"waited for {text}: {(tmp_path / 'said.txt').read_text()}"
                     time.sleep(0.02)
 
             wait_for("controller Ready")
             os.write(master, b"s")
             wait_for("controller Active, Forward, None | vehicle Active, None, +")
-            time.sleep(1.0)
+            time.sleep(2.0)
             os.write(master, b" ")
-            wait_for("controller Fault, Forward, OperatorStop")
-            wait_for("OperatorStop | vehicle Active, None, standstill")
+            wait_for("controller Fault, Forward, OperatorStop | vehicle Active, None, standstill")
             os.write(master, b"c")
-            wait_for("controller Manual")
+            wait_for("controller Manual, Idle")
             os.write(master, b"q")
             assert operate.wait(10.0) == 0
-            for process in started[:2]:
+            for process in reversed(started[:2]):
                 process.send_signal(signal.SIGTERM)
-                process.wait(10.0)
+                assert process.wait(10.0) == 0
         finally:
             for process in started:
                 if process.poll() is None:
