@@ -30,11 +30,11 @@ def demo(*arguments: str, out: str = "run", expected: int = 0) -> Any:
 
 
 def test_a_passed_test_and_what_it_leaves(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    figures = demo("--side", "right", "--json", "figures.json")
+    figures = demo("--side", "right", "--json", "run/mine.json")
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "PASS" in shown.out
-    assert json.loads((here / "figures.json").read_text()) == figures
+    assert json.loads((here / "run" / "mine.json").read_text()) == figures
     assert (figures["passed"], figures["score"], figures["cones_touched"], figures["why"]) == (True, 100, 0, None)
     assert figures["side"] == "right"
     assert figures["loop"]["scheduler"] == "virtual time"

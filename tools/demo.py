@@ -110,10 +110,10 @@ class Driven(NamedTuple):
 def run(args: argparse.Namespace) -> int:
     """Run the demo; return its exit status. Raises UserError before anything is started or written."""
     plan = _plan(args)
-    json_file = None if args.json is None else Path(args.json)
-    if json_file is not None:
-        check_writable_file(json_file)
     folder = RunFolder.plan(args.out, f"{plan.vehicle.name}-{plan.course.name}-{plan.side}-{plan.scenario.name}")
+    json_file = None if args.json is None else Path(args.json)
+    if json_file is not None and json_file.parent.resolve() != folder.path.resolve():
+        check_writable_file(json_file)
     from rich.console import Console  # noqa: PLC0415
 
     console = Console(highlight=False)
@@ -186,7 +186,7 @@ def _tables(plan: Plan, stack: ExitStack) -> Path:
     shipped = tables_folder(plan.vehicle, plan.course)
     if shipped is not None:
         return shipped
-    print(f"tables    none are shipped for {plan.vehicle.name} on {plan.course.name}: designing them now", flush=True)
+    print(f"tables    no fresh ones are shipped for {plan.vehicle.name} on {plan.course.name}: made now", flush=True)
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / "tables"
     design_tables(plan.vehicle, plan.course, folder)
     return folder
@@ -226,6 +226,8 @@ def _drive_live(plan: Plan, tables: Path, folder: RunFolder, bus: can.BusABC) ->
         emulator += [f"--{name}", value]
     path = load_path(tables, plan.side)
     _begin_folder(plan, tables, folder)
+    watch = f"python -m can.viewer {' '.join(bus_options)}"
+    print(f"bus       {plan.bus} (watch it in another terminal: {watch})")
     try:
         with BusLog(folder.path / "bus.log", _log_channel(plan.bus)) as log:
             live = LiveRun(
