@@ -209,7 +209,7 @@ class OutsidePlant:
             if self.speed_mps == 0.0:
                 self.park_brake = int(command["park_brake_cmd"])
                 gear = int(command["gear_cmd"])
-                if gear not in (GEAR_NONE, self.gear) and self.gear != GEAR_NONE:
+                if gear in (PARK, REVERSE, NEUTRAL, DRIVE) and gear != self.gear != GEAR_NONE:
                     self.gear, self.gear_wanted = GEAR_NONE, gear
                     self.gear_ready_ns = self.now_ns + round(self.car["gear_change_s"] * 1e9)
             fits = self.gear == (DRIVE if speed_wanted > 0 else REVERSE) and not self.park_brake
