@@ -15,6 +15,7 @@ COMMANDS = {
     "demo": ("tools.demo", "the whole test: car and controller as processes of their own, judged by the examiner"),
     "operate": ("tools.operator_station", "the operator station alone: start, stop, emergency stop, clear by keys"),
     "design": ("tools.design_cmd", "make or check the controller's tables from vehicle and course files"),
+    "guest": ("tools.guest.command", "run a command where a real vcan0 is, on any Linux on x86-64, without root"),
 }
 """Subcommand: (module with add_arguments(parser) and run(args) -> exit status, what it is for)."""
 
@@ -24,7 +25,7 @@ PROCESSES = {
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "design")
+ORDER = ("demo", "drive", "emulate", "operate", "design", "guest")
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2
