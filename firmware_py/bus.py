@@ -1,9 +1,10 @@
 """The CAN bus as the cycle sees it: drain all that has come, send what is due; no thread, no waiting, no exception."""
 
 import contextlib
+import errno
 import logging
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING, NamedTuple
 
 from firmware_py.errors import UserError
 
@@ -14,20 +15,38 @@ DEFAULT_INTERFACE = "loopbus"
 FRAMES_PER_DRAIN = 256
 """Bound of one drain: a flooded bus costs the cycle a bounded time; the rest waits for the next cycle."""
 
+EMULATED_INTERFACES = frozenset({DEFAULT_INTERFACE, "virtual"})
+EMULATED_CHANNEL_PREFIX = "vcan"
+
 Frame = tuple[int, bytes]
+
+
+class Heard(NamedTuple):
+    """One frame of any kind with its arrival time by the driver's clock, s (0 where the driver gives none)."""
+
+    stamp_s: float
+    arbitration_id: int
+    data: bytes
+    bits: int
+    is_error: bool
+    is_plain: bool
 
 
 class Bus:
     """One open interface. All counts are since start.
 
+    `interface`, `channel`, `bitrate` are python-can's names of it, the bit rate only where one was given.
     `error_frames`: error frames received. `foreign`: frames of a kind that the DBC does not know (29-bit id, remote,
     CAN FD). `drains_cut`: drains that ended at their bound. `receive_failed`, `send_failed`: calls that the driver
     refused (bus off, interface down, full queue); to the cycle they are silence, which its timeouts judge.
     """
 
-    def __init__(self, bus: "BusABC") -> None:
+    def __init__(self, bus: "BusABC", interface: str = "", channel: str = "", bitrate: int | None = None) -> None:
         from can import CanError, Message  # noqa: PLC0415 -- heavy; see open_bus
 
+        self.interface = interface
+        self.channel = channel
+        self.bitrate = bitrate
         self._bus = bus
         self._message = Message
         self._driver_errors = (CanError, OSError)
@@ -41,6 +60,11 @@ class Bus:
     def description(self) -> str:
         """What the driver says it is connected to."""
         return str(self._bus.channel_info)
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether a real car may be on the other end: everything that is not known to be emulated."""
+        return self.interface not in EMULATED_INTERFACES and not self.channel.startswith(EMULATED_CHANNEL_PREFIX)
 
     def drain(self) -> list[Frame]:
         """Return all frames that wait, oldest first, at most FRAMES_PER_DRAIN."""
@@ -62,6 +86,26 @@ class Bus:
         self.drains_cut += 1
         return frames
 
+    def hear(self) -> list[Heard]:
+        """Return all frames that wait, of every kind, with their stamps; bounded like `drain`, and slower."""
+        heard: list[Heard] = []
+        for _ in range(FRAMES_PER_DRAIN):
+            try:
+                message = self._bus.recv(0)
+            except self._driver_errors:
+                self.receive_failed += 1
+                return heard
+            if message is None:
+                return heard
+            self.error_frames += message.is_error_frame
+            plain = not (message.is_extended_id or message.is_remote_frame or message.is_fd)
+            data = bytes(message.data)
+            bits = frame_bits(len(data), extended=message.is_extended_id)
+            error = message.is_error_frame
+            heard.append(Heard(message.timestamp, message.arbitration_id, data, bits, error, plain and not error))
+        self.drains_cut += 1
+        return heard
+
     def send(self, frames: Iterable[Frame]) -> int:
         """Send the frames in their order; return how many of them the driver refused."""
         failed = 0
@@ -79,12 +123,27 @@ class Bus:
             self._bus.shutdown()
 
 
+def frame_bits(data_bytes: int, *, extended: bool = False) -> int:
+    """Return the greatest length of a frame on the wire, bits: with the most stuff bits and the space after it.
+
+    Source: ISO 11898-1; 34 (54) bits before the data are subject to stuffing, one after each run of five.
+    """
+    stuffed = (54 if extended else 34) + 8 * data_bytes
+    return stuffed + 13 + (stuffed - 1) // 4
+
+
 def open_bus(
-    interface: str | None = None, channel: str | None = None, bitrate: int | None = None, *, use_config: bool = True
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    *,
+    use_config: bool = True,
+    only_ids: Collection[int] = (),
 ) -> Bus:
     """Open the bus that the options name, in python-can's terms.
 
-    What is None comes from python-can's own configuration (CAN_* variables, can.conf) where `use_config` allows it;
+    With `only_ids` the kernel passes only these 11-bit ids on, where the driver has filters of the kernel: what others
+    flood the bus with then costs the cycle nothing. What is None comes from python-can's own configuration (CAN_* variables, can.conf) where `use_config` allows it;
     without any of it the embedded bus is opened. Raises UserError.
     """
     import can  # noqa: PLC0415 -- heavy, and the tests of everything else do without it
@@ -102,16 +161,37 @@ def open_bus(
         if options["interface"] != DEFAULT_INTERFACE and "channel" not in options:
             # python-can would take its driver's default, which for socketcan is the physical can0.
             raise UserError(f"--channel: interface {options['interface']} needs one, e.g. --channel vcan0")
-        # No filters: python-can's recv(0) ends at a frame that its software filter drops, with more frames waiting.
-        return Bus(can.Bus(ignore_config=True, **options))  # type: ignore[arg-type]
+        if options["interface"] == "socketcan" and only_ids:
+            # Filters nowhere else: python-can's recv(0) ends at a frame that its software filter drops, with more
+            # frames waiting. SocketCAN's filters are the kernel's; error frames have a filter of their own.
+            options["can_filters"] = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in sorted(only_ids)]
+        bus = can.Bus(ignore_config=True, **options)  # type: ignore[arg-type]
     except UserError:
         raise
     except Exception as error:  # drivers raise anything for hardware or libraries that are not there, NameError too
         name = f"{options.get('interface', DEFAULT_INTERFACE)} {options.get('channel', '')}".strip()
-        raise UserError(f"CAN interface {name}: cannot be opened ({_reason(error)})") from None
+        raise UserError(f"CAN interface {name}: cannot be opened ({_reason(error, options)})") from None
+    given = options.get("bitrate")
+    return Bus(
+        bus, str(options["interface"]), str(options.get("channel", "")), given if isinstance(given, int) else None
+    )
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, options: dict[str, object]) -> str:
+    """Return what is wrong and what would be right, in one line."""
+    if isinstance(error, OSError) and error.errno in _OPEN_ERRORS:
+        return _OPEN_ERRORS[error.errno]
+    if isinstance(error, NotImplementedError) and options["interface"] == DEFAULT_INTERFACE:
+        return "the embedded bus comes with the emulator and is not installed here; name a bus, as in -i socketcan"
     if isinstance(error, (NameError, ImportError)):  # kvaser's way of saying that its library is missing
         return "the library of its driver is not installed"
     return " ".join(str(error).split()) or type(error).__name__
+
+
+_OPEN_ERRORS = {
+    errno.EAFNOSUPPORT: "this kernel has no SocketCAN: load the modules can and can_raw, or use -i loopbus",
+    errno.ENODEV: "there is no such interface; `ip link` lists those that there are",
+    errno.ENETDOWN: "the interface is down: `ip link set CHANNEL up`",
+    errno.EPERM: "no permission for raw CAN sockets",
+    errno.EACCES: "no permission for raw CAN sockets",
+}

@@ -26,25 +26,6 @@ NODE = "CTRL"
 FRAME_BYTES = 8
 
 
-class HealthTiming(NamedTuple):
-    """CTRL_HealthTiming: lateness and duration over the last second, us."""
-
-    wake_late_p50_us: int
-    wake_late_p99_us: int
-    wake_late_max_us: int
-    step_time_p99_us: int
-
-
-class HealthCounts(NamedTuple):
-    """CTRL_HealthCounts: what went wrong in the loop since start."""
-
-    overrun_count: int
-    rejected_crc_count: int
-    rejected_counter_count: int
-    rejected_length_count: int
-    send_failed_count: int
-
-
 STRUCTS: dict[str, type[Any]] = {
     "CTRL_SysCmd": signals.SysCommand,
     "CTRL_SteerCmd": signals.SteerCommand,
@@ -53,8 +34,8 @@ STRUCTS: dict[str, type[Any]] = {
     "CTRL_CycleInputs": signals.UsedCounters,
     "CTRL_Track": signals.Track,
     "CTRL_Version": signals.ControllerVersion,
-    "CTRL_HealthTiming": HealthTiming,
-    "CTRL_HealthCounts": HealthCounts,
+    "CTRL_HealthTiming": signals.HealthTiming,
+    "CTRL_HealthCounts": signals.HealthCounts,
     "VEH_SysRpt": signals.SysReport,
     "VEH_SteerRpt": signals.SteerReport,
     "VEH_MotionRpt": signals.MotionReport,

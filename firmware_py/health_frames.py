@@ -1,28 +1,8 @@
 """The loop's own health, as it goes onto the bus once a second."""
 
-from typing import NamedTuple
-
 from firmware_py.codec import Mailbox
+from firmware_py.core.signals import HealthCounts, HealthTiming
 from firmware_py.histogram import Histogram
-
-
-class HealthTiming(NamedTuple):
-    """CTRL_HealthTiming: over the last second, microseconds."""
-
-    wake_late_p50_us: float
-    wake_late_p99_us: float
-    wake_late_max_us: float
-    step_time_p99_us: float
-
-
-class HealthCounts(NamedTuple):
-    """CTRL_HealthCounts: since start."""
-
-    overrun_count: int
-    rejected_crc_count: int
-    rejected_counter_count: int
-    rejected_length_count: int
-    send_failed_count: int
 
 
 class HealthFrames:
@@ -40,10 +20,10 @@ class HealthFrames:
     def timing(self) -> HealthTiming:
         """Return the timing since the last call."""
         timing = HealthTiming(
-            wake_late_p50_us=self._late.quantile_us(0.5),
-            wake_late_p99_us=self._late.quantile_us(0.99),
-            wake_late_max_us=self._late.max_us,
-            step_time_p99_us=self._step.quantile_us(0.99),
+            wake_late_p50_us=round(self._late.quantile_us(0.5)),
+            wake_late_p99_us=round(self._late.quantile_us(0.99)),
+            wake_late_max_us=round(self._late.max_us),
+            step_time_p99_us=round(self._step.quantile_us(0.99)),
         )
         self._late.clear()
         self._step.clear()

@@ -70,7 +70,7 @@ def compiled_step() -> Callable[..., Any]:
 def array_tables(tables: Tables) -> Tables:
     """Return the tables with float64 arrays in place of tuples, same shapes, same bits."""
     return tables._replace(
-        leg=tuple(_array_leg(leg) for leg in tables.leg),
+        leg=(_array_leg(tables.leg[0]), _array_leg(tables.leg[1])),
         gains=GainTable(
             speed_grid_mps=np.array(tables.gains.speed_grid_mps),  # type: ignore[arg-type]
             last_row=tables.gains.last_row,
@@ -80,4 +80,5 @@ def array_tables(tables: Tables) -> Tables:
 
 
 def _array_leg(leg: LegTable) -> LegTable:
-    return LegTable(*[np.array(value) if isinstance(value, tuple) else value for value in leg])
+    columns: dict[str, Any] = {name: np.array(value) for name, value in leg._asdict().items() if isinstance(value, tuple)}
+    return leg._replace(**columns)

@@ -181,6 +181,25 @@ class ControllerVersion(NamedTuple):
     ctrl_vehicle_hash: int
 
 
+class HealthTiming(NamedTuple):
+    """CTRL_HealthTiming: lateness of the wake-up and duration of the cycle over the last second, us."""
+
+    wake_late_p50_us: int
+    wake_late_p99_us: int
+    wake_late_max_us: int
+    step_time_p99_us: int
+
+
+class HealthCounts(NamedTuple):
+    """CTRL_HealthCounts: what went wrong in the loop since start."""
+
+    overrun_count: int
+    rejected_crc_count: int
+    rejected_counter_count: int
+    rejected_length_count: int
+    send_failed_count: int
+
+
 class Inputs(NamedTuple):
     """All that one cycle knows of the world: the newest valid values, and which of them are new.
 
