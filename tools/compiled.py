@@ -80,5 +80,6 @@ def array_tables(tables: Tables) -> Tables:
 
 
 def _array_leg(leg: LegTable) -> LegTable:
-    columns: dict[str, Any] = {name: np.array(value) for name, value in leg._asdict().items() if isinstance(value, tuple)}
-    return leg._replace(**columns)
+    columns = {name: value for name, value in leg._asdict().items() if isinstance(value, tuple)}
+    arrays: dict[str, Any] = {name: np.array(column) for name, column in columns.items()}
+    return leg._replace(**arrays)
