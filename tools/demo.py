@@ -69,8 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument(
         "--realtime",
         choices=("auto", "off", "required"),
-        default="auto",
-        help="real-time priority (SCHED_FIFO): where permitted (auto), never, or end with an error without it",
+        help="real-time priority (SCHED_FIFO): where permitted (auto), never (off), or end with an error without it; "
+        "default: auto, for the controller on a physical bus required",
     )
     out = parser.add_argument_group("what is written")
     out.add_argument(
@@ -91,7 +91,8 @@ class Plan(NamedTuple):
     law: str
     seed: int
     lockstep: bool
-    realtime: str
+    realtime: str | None
+    """None leaves the choice to each process, which knows whether its bus is a real one."""
     bus: BusChoice
     named: dict[str, str]
     """vehicle, course and scenario as the user named them, for the processes."""
@@ -219,7 +220,8 @@ def _drive_live(plan: Plan, tables: Path, folder: RunFolder, bus: can.BusABC) ->
     from tools.progress import Progress  # noqa: PLC0415
 
     bus_options = plan.bus.arguments()
-    options = ["--side", plan.side, "--realtime", plan.realtime, "--status", "--out", str(folder.path)]
+    options = ["--side", plan.side, "--status", "--out", str(folder.path)]
+    options += [] if plan.realtime is None else ["--realtime", plan.realtime]
     controller = [*bus_options, *options, "--no-config", "--once", "--tables", str(tables), "--law", plan.law]
     emulator = [*bus_options, *options, "--no-config", "--seed", str(plan.seed)]
     for name, value in plan.named.items():

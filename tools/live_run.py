@@ -54,7 +54,14 @@ class LiveRun:
     """Starts the processes, presses start, watches, and leaves none of them behind."""
 
     def __init__(
-        self, *, bus: can.BusABC, station: Station, log: BusLog, progress: Progress, path: PathTable, realtime: str
+        self,
+        *,
+        bus: can.BusABC,
+        station: Station,
+        log: BusLog,
+        progress: Progress,
+        path: PathTable,
+        realtime: str | None,
     ) -> None:
         self._bus = bus
         self._station = station
@@ -302,7 +309,7 @@ class _Witness:
 
 
 @contextlib.contextmanager
-def _first_among_ordinary(realtime: str) -> Iterator[None]:
+def _first_among_ordinary(realtime: str | None) -> Iterator[None]:
     """Run at a low real-time priority where that is permitted and wanted, and without garbage collection."""
     changed = False
     if realtime != "off" and hasattr(os, "sched_setscheduler"):
