@@ -159,6 +159,11 @@ def test_no_lag_means_at_once() -> None:
     assert step_speed(0.0, 0.0, 0.7, 0.0, 0.7, 2.0, MS) == (pytest.approx(0.698), 2.0)
 
 
+@pytest.mark.parametrize("speed", [1e-4, -1e-4, 1.5e-3, -1.5e-3])
+def test_a_hard_brake_does_not_overshoot(speed: float) -> None:
+    assert step_speed(0.3, 0.0, speed, 4.0, speed, 4.0, MS)[0] == 0.0
+
+
 def test_drive_and_brake_never_change_the_direction() -> None:
     rng = random.Random(5)
     speed, decel = 0.5, 0.0
