@@ -45,10 +45,13 @@ class Bus:
     """One open interface. All counts are since start.
 
     `interface`, `channel`, `bitrate` are python-can's names of it, the bit rate only where one was given.
-    `error_frames`: error frames received. `foreign`: frames of a kind that the DBC does not know (29-bit id, remote,
-    CAN FD). `drains_cut`: drains that ended at their bound. `receive_failed`, `send_failed`: calls that the driver
-    refused (bus off, interface down, full queue); to the cycle they are silence, which its timeouts judge.
+    `sent`: frames given to the driver. `error_frames`: error frames received. `foreign`: frames of a kind that the DBC
+    does not know (29-bit id, remote, CAN FD). `drains_cut`: drains that ended at their bound. `receive_failed`,
+    `send_failed`: calls that the driver refused (bus off, interface down, full queue); to the cycle they are silence,
+    which its timeouts judge.
     """
+
+    is_listening_only = False
 
     def __init__(self, bus: "BusABC", interface: str = "", channel: str = "", bitrate: int | None = None) -> None:
         from can import CanError, Message  # noqa: PLC0415 -- heavy; see open_bus
@@ -68,6 +71,7 @@ class Bus:
         self.drains_cut = 0
         self.receive_failed = 0
         self.send_failed = 0
+        self.sent = 0
 
     @property
     def description(self) -> str:
@@ -146,15 +150,17 @@ class Bus:
 
     def send(self, frames: Iterable[Frame]) -> int:
         """Send the frames in their order; return how many of them the driver refused."""
-        failed = 0
+        failed = sent = 0
         for arbitration_id, data in frames:
             try:
                 if self._socket is not None:
                     self._socket.send(_CAN_FRAME.pack(arbitration_id, len(data), data), socket.MSG_DONTWAIT)
                 else:
                     self._bus.send(self._message(arbitration_id=arbitration_id, data=data, is_extended_id=False))
+                sent += 1
             except self._driver_errors:
                 failed += 1
+        self.sent += sent
         self.send_failed += failed
         return failed
 
@@ -162,6 +168,21 @@ class Bus:
         """Give the interface back."""
         with contextlib.suppress(*self._driver_errors):
             self._bus.shutdown()
+
+
+class ListeningBus(Bus):
+    """A bus to which nothing is ever sent, and on which another controller may drive: its frames are not heard."""
+
+    is_listening_only = True
+    only_ids: Collection[int] = frozenset()
+
+    def drain(self) -> list[Frame]:
+        """Return the frames that wait, without those of other ids."""
+        return [frame for frame in super().drain() if frame[0] in self.only_ids]
+
+    def send(self, frames: Iterable[Frame]) -> int:
+        """Send nothing."""
+        return 0
 
 
 def frame_bits(data_bytes: int, *, extended: bool = False) -> int:
@@ -180,12 +201,14 @@ def open_bus(
     *,
     use_config: bool = True,
     only_ids: Collection[int] = (),
+    listen_only: bool = False,
 ) -> Bus:
     """Open the bus that the options name, in python-can's terms.
 
-    With `only_ids` the kernel passes only these 11-bit ids on, where the driver has filters of the kernel: what others
-    flood the bus with then costs the cycle nothing. What is None comes from python-can's own configuration (CAN_* variables, can.conf) where `use_config` allows it;
-    without any of it the embedded bus is opened. Raises UserError.
+    What is None comes from python-can's own configuration (CAN_* variables, can.conf) where `use_config` allows it;
+    without any of it the embedded bus is opened. With `only_ids` the kernel passes on these 11-bit ids only, where the
+    driver has filters of the kernel: what others flood the bus with then costs the cycle nothing. With `listen_only`
+    nothing is ever sent, and `only_ids` alone are heard, whatever the driver. Raises UserError.
     """
     import can  # noqa: PLC0415 -- heavy, and the tests of everything else do without it
 
@@ -213,16 +236,19 @@ def open_bus(
         name = f"{options.get('interface', DEFAULT_INTERFACE)} {options.get('channel', '')}".strip()
         raise UserError(f"CAN interface {name}: cannot be opened ({_reason(error, options)})") from None
     given = options.get("bitrate")
-    return Bus(
-        bus, str(options["interface"]), str(options.get("channel", "")), given if isinstance(given, int) else None
-    )
+    names = (str(options["interface"]), str(options.get("channel", "")), given if isinstance(given, int) else None)
+    if not listen_only:
+        return Bus(bus, *names)
+    silent = ListeningBus(bus, *names)
+    silent.only_ids = frozenset(only_ids)
+    return silent
 
 
 def _reason(error: Exception, options: dict[str, object]) -> str:
     """Return what is wrong and what would be right, in one line."""
     if isinstance(error, OSError) and error.errno in _OPEN_ERRORS:
         return _OPEN_ERRORS[error.errno]
-    if isinstance(error, NotImplementedError) and options["interface"] == DEFAULT_INTERFACE:
+    if isinstance(error, NotImplementedError) and options.get("interface") == DEFAULT_INTERFACE:
         return "the embedded bus comes with the emulator and is not installed here; name a bus, as in -i socketcan"
     if isinstance(error, (NameError, ImportError)):  # kvaser's way of saying that its library is missing
         return "the library of its driver is not installed"

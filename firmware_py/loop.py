@@ -8,15 +8,18 @@ import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from types import FrameType
 from typing import Any, NamedTuple
 
-from firmware_py.bus import Bus
+from firmware_py.bus import Bus, Heard
 from firmware_py.core import conditions as c
 from firmware_py.core.signals import MODE_FAULT, MODE_MANUAL
 from firmware_py.errors import UserError
 from firmware_py.histogram import Histogram
 from firmware_py.node import ControllerNode
+from firmware_py.rates import RateWatch
+from firmware_py.realtime import Outcome
 from firmware_py.reasons import TEXT
 
 PERIOD_NS = 10_000_000
@@ -49,11 +52,21 @@ class RunResult(NamedTuple):
 class Loop:
     """Runs a controller node on a bus until the manoeuvre is over or a signal asks for the end."""
 
-    def __init__(self, node: ControllerNode, bus: Bus, *, fifo: bool, once: bool, status_fd: int | None) -> None:
+    def __init__(
+        self,
+        node: ControllerNode,
+        bus: Bus,
+        rates: RateWatch,
+        *,
+        realtime: Outcome,
+        once: bool,
+        status_fd: int | None,
+    ) -> None:
         self._node = node
         self._bus = bus
-        self._spin_ns = SPIN_NS if fifo else 0
-        self._scheduler = "SCHED_FIFO" if fifo else "SCHED_OTHER"
+        self._rates = rates
+        self._spin_ns = SPIN_NS if realtime.fifo else 0
+        self._realtime = realtime
         self._once = once
         self._status_fd = status_fd
         self._wake = Histogram()
@@ -103,6 +116,7 @@ class Loop:
                 self._longest_stall = max(self._longest_stall, overruns)
                 time.sleep(REGATHER_S)
                 frames += bus.drain()
+            frames = self._rates.sift(frames, 1 + overruns, holding=not node.is_driving)
             bus.send(node.cycle(wake_ns, frames, overruns, bus.send_failed))
 
             step_ns = time.monotonic_ns() - wake_ns
@@ -138,7 +152,7 @@ class Loop:
         over = (self._once and (self._completed or seen.mode == MODE_FAULT)) or self._signalled
         if not over:
             return 0
-        if node.is_driving and ending < STOPPING_CYCLES:
+        if node.is_driving and not self._bus.is_listening_only and ending < STOPPING_CYCLES:
             # Stopping: the end begins when the car stands.
             return 0
         return ending + 1
@@ -152,6 +166,7 @@ class Loop:
             {
                 **seen._asdict(),
                 "reason_text": TEXT[seen.reason],
+                "held_reports": list(self._rates.held.values()),
                 "wake_late_p99_us": self._wake.quantile_us(0.99),
                 "overruns": self._node.overruns,
             }
@@ -182,14 +197,39 @@ class Loop:
             "wake_max_us": self._wake.max_us,
             "step_p50_us": self._step.quantile_us(0.5),
             "step_p99_us": self._step.quantile_us(0.99),
-            "scheduler": self._scheduler,
-            "frames_sent": node.frames_sent - self._bus.send_failed,
+            "scheduler": "SCHED_FIFO" if self._realtime.fifo else "SCHED_OTHER",
+            "realtime": self._realtime.steps,
+            "listen_only": self._bus.is_listening_only,
+            "frames_sent": self._bus.sent,
             "frames_received": mailbox.received,
             "frames_lost": mailbox.lost,
             "frames_rejected": mailbox.rejected_crc + mailbox.rejected_counter + mailbox.rejected_length,
+            "frames_foreign": mailbox.foreign + self._bus.foreign,
+            "error_frames": self._bus.error_frames,
+            "drains_cut": self._bus.drains_cut,
+            "receive_failed": self._bus.receive_failed,
             "send_failed": self._bus.send_failed,
+            "held_reports": list(self._rates.held.values()),
             "internal_errors": list(node.internal_errors),
         }
+
+
+def listen(bus: Bus, duration_s: float, take: Callable[[int, int, list[Heard]], bool]) -> None:
+    """Wake on the cycle's grid and hand over (wake-up time ns, lateness ns, frames), until `take` says it is enough."""
+    deadline_ns = (time.monotonic_ns() // PERIOD_NS + 2) * PERIOD_NS
+    end_ns = deadline_ns + round(duration_s * 1e9)
+    while deadline_ns < end_ns:
+        time.sleep(max(deadline_ns - time.monotonic_ns(), 0) * 1e-9)
+        wake_ns = time.monotonic_ns()
+        late_ns = wake_ns - deadline_ns
+        deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
+        if take(wake_ns, late_ns, bus.hear()):
+            return
+
+
+def clock_resolution_ns() -> int:
+    """Return the resolution of the clock that paces the loop."""
+    return max(round(time.get_clock_info("monotonic").resolution * 1e9), 1)
 
 
 def status_writer(enabled: bool) -> int | None:

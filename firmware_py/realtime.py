@@ -77,7 +77,7 @@ def _affinity(cpu: int | None) -> str:
         return "any"
     try:
         os.sched_setaffinity(0, {cpu})
-    except (OSError, AttributeError, OverflowError):
+    except (OSError, AttributeError, OverflowError, ValueError):
         usable = ", ".join(map(str, sorted(os.sched_getaffinity(0)))) if hasattr(os, "sched_getaffinity") else "any"
         raise UserError(f"--cpu {cpu}: this process cannot run there; the CPUs it may use are {usable}") from None
     return str(cpu)
