@@ -12,10 +12,12 @@ cross-track error (rms, worst speed of the grid).
 import itertools
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.core.predictor import QUEUE_LENGTH
 from sim.data_files import Vehicle
 from sim.errors import UserError
 from tools.design import model
@@ -39,14 +41,16 @@ DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
 """What the car does by itself: noise of cross-track error (m), heading (rad) and curvature disturbance (1/m) per root
 metre of travel. The last stands for steering bias, steering gain and tyres, whose effect changes as the path bends."""
 
-OBSERVER_PACES = (1.0, 0.8, 0.65, 0.5, 0.4)
-"""Observers tried: process noise of `DISTURBANCE` with its poles moved by about these factors."""
+OBSERVER_PACES = (0.8, 0.65, 0.5, 0.4)
+"""Observers tried: process noise of `DISTURBANCE` with its poles moved by about these factors. Faster ones spend
+more of the steering's rate on the pose's noise and bring no smaller largest error."""
 
 PREVIEW_S = 0.5
 """The preview distance in seconds of travel."""
 
-FASTEST_PACE = {"car": 1.0, "pid_ff": 0.65}
-"""Largest pace of the PID: above it the pose's noise costs more than the quicker answer gains."""
+FASTEST_PACE = {"car": 1.25, "pid_ff": 0.65}
+"""Largest pace of the PID: above it the pose's noise costs more than the quicker answer gains. Unfiltered, that noise
+saturates the steering's rate, which no linear margin shows: twice this pace loses a 4 m wheelbase off the path."""
 
 SLOWEST_PACE = 0.3
 """Below it a start off the path would not be corrected within a leg."""
@@ -130,27 +134,32 @@ def observer_model(
     )
 
 
+@cache
 def observer_gains(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> Floats:
     """Steady-state Kalman gains per cycle of (e, heading error, disturbance), shape (3, 2); zeros at standstill.
 
-    noise: process noise of the three per root metre of travel.
+    noise: process noise of the three per root metre of travel. The array cannot be written to.
     """
     from scipy.linalg import solve_discrete_are  # noqa: PLC0415  (heavy, and only the design needs it)
 
     if speed_mps == 0.0:
-        return np.zeros((3, 2))
+        return np.broadcast_to(0.0, (3, 2))
     f, h, q, r = observer_model(direction, speed_mps, noise)
     # In units of the measurement's noise: the solver is accurate where numbers are alike.
     unit = np.array([POSITION_NOISE_M, HEADING_NOISE_RAD, HEADING_NOISE_RAD])
     covariance = solve_discrete_are(
         (f * unit / unit[:, None]).T, h.T, q / np.outer(unit, unit), r / np.outer(unit[:2], unit[:2])
     ) * np.outer(unit, unit)
-    return np.asarray(covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r))
+    gains = np.asarray(covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r))
+    gains.setflags(write=False)
+    return gains
 
 
-def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer: Floats) -> Row:
-    """A row of the gain table; `observer` (3, 2) is not used by a law that takes each pose as it comes."""
-    correction = observer if law in PREDICTING_LAWS else np.eye(3, 2)
+def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float) -> Row:
+    """A row of the gain table; a law that takes each pose as it comes has no observer, whatever its pace."""
+    correction = np.eye(3, 2)
+    if law in PREDICTING_LAWS:
+        correction = observer_gains(direction, speed_mps, observer_noise(observer_pace))
     kp, ki, kd = pid_gains(pid_pace)
     l_ee, l_ep, l_pe, l_pp, l_de, l_dp = (float(value) for value in correction.reshape(-1))
     return Row(direction, speed_mps, PREVIEW_S * speed_mps, kp, ki, kd, l_ee, l_ep, l_pe, l_pp, l_de, l_dp)
@@ -227,12 +236,17 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
 
     Deterministic. Raises UserError where no gains survive the vehicle's box, naming the dimension to narrow.
     """
+    latency = model.nominal_of(vehicle).latency_samples
+    if latency >= QUEUE_LENGTH:
+        raise UserError(
+            f"vehicle {vehicle.name}: pose_latency_samples + command_latency_samples = {latency}: must be below"
+            f" {QUEUE_LENGTH}, the number of commands that the controller remembers"
+        )
     tables: dict[str, list[tuple[float, ...]]] = {}
     for law in LAWS:
         schedule = choose(vehicle, law)
-        noise = observer_noise(schedule.observer_pace)
         tables[law] = [
-            tuple(row_of(law, direction, speed, pace, observer_gains(direction, speed, noise)))
+            tuple(row_of(law, direction, speed, pace, schedule.observer_pace))
             for direction in (1.0, -1.0)
             for speed, pace in zip(SPEED_GRID_MPS, schedule.pid_pace, strict=True)
         ]
@@ -259,22 +273,20 @@ def _schedule(vehicle: Vehicle, law: str, observer_pace: float) -> Schedule | No
     cars = corners(vehicle)
     nominal = model.nominal_of(vehicle)
     checked = checked_speeds(vehicle)
-    noise = observer_noise(observer_pace)
     fastest = FASTEST_PACE[law]
     paces: list[float] = []
     worst = 0.0
     # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
     for speed in reversed(checked):
-        observer = observer_gains(1.0, speed, noise)
 
-        def survives(pace: float, speed: float = speed, observer: Floats = observer) -> bool:
-            return _survives(row_of(law, 1.0, speed, pace, observer), nominal, cars, law in PREDICTING_LAWS)
+        def survives(pace: float, speed: float = speed) -> bool:
+            return _survives(row_of(law, 1.0, speed, pace, observer_pace), nominal, cars, law in PREDICTING_LAWS)
 
         pace = _largest(survives, SLOWEST_PACE, fastest)
         if pace is None:
             return None
         paces.append(pace)
-        chosen = row_of(law, 1.0, speed, pace, observer)
+        chosen = row_of(law, 1.0, speed, pace, observer_pace)
         worst = max(worst, modelled_error_m(chosen, nominal, cars[0], law in PREDICTING_LAWS))
     beyond = len(SPEED_GRID_MPS) - 1 - len(checked)
     by_speed = (paces[-1], *reversed(paces), *(paces[0],) * beyond)
@@ -308,7 +320,7 @@ def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int
 def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
     """One line that names the dimension of the box which keeps the softest gains from surviving."""
     speed = checked_speeds(vehicle)[-1]
-    row = row_of(law, 1.0, speed, SLOWEST_PACE, observer_gains(1.0, speed, observer_noise(OBSERVER_PACES[-1])))
+    row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1])
     z = on_circle(frequencies(speed))
 
     def margin(car: model.Corner) -> float:
@@ -318,14 +330,11 @@ def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
 
     cars = corners(vehicle)
     worst = min(cars, key=margin)
-    # The dimension that helps most when it alone is taken back, to the nominal car or, if that is the worst, to none.
-    home = model.Corner("", 0.0, 0.0, 1.0) if worst is cars[0] else cars[0]
-    trials = {
-        ("steering_lag_s",): worst._replace(steering_lag_s=home.steering_lag_s),
-        ("pose_latency_samples", "command_latency_samples"): worst._replace(latency_samples=home.latency_samples),
-        ("wheelbase_m",): worst._replace(gain=1.0),
-    }
-    keys = max(trials, key=lambda names: margin(trials[names]))
+    # The dimension that helps most when it alone is nominal; where none helps enough, when it alone does not delay.
+    blamed = _dimension_that_helps(worst, cars[0], margin)
+    if blamed[0] < LEAST_DISK_MARGIN:
+        blamed = _dimension_that_helps(worst, model.Corner("", 0.0, 0.0, 1.0), margin)
+    keys = blamed[1]
     own, low, high = (
         sum(values) for values in zip(*((getattr(vehicle, key), *vehicle.box[key]) for key in keys), strict=True)
     )
@@ -333,3 +342,18 @@ def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
         f"vehicle {vehicle.name}: {' + '.join(keys)} = {own:g} ({low:g} to {high:g}): no gains of law {law} keep a disk"
         f" margin of {LEAST_DISK_MARGIN:g} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
     )
+
+
+def _dimension_that_helps(
+    car: model.Corner, home: model.Corner, margin: Callable[[model.Corner], float]
+) -> tuple[float, tuple[str, ...]]:
+    """The largest margin of a car with one dimension taken from `home`, and that dimension's keys in the file."""
+    only_steering = max(min(car.gain, 1.0 + GAIN_SPREAD), 1.0 - GAIN_SPREAD)
+    trials = {
+        ("steering_lag_s",): car._replace(steering_lag_s=home.steering_lag_s),
+        ("pose_latency_samples", "command_latency_samples"): car._replace(latency_samples=home.latency_samples),
+        ("wheelbase_m",): car._replace(gain=only_steering),
+    }
+    margins = {keys: margin(trial) for keys, trial in trials.items()}
+    best = max(margins, key=lambda keys: margins[keys])
+    return margins[best], best
