@@ -21,11 +21,12 @@ COMMANDS = {
 
 PROCESSES = {
     "drive": ("firmware_py", "the controller alone, on any bus; a vehicle and an operator station must be there too"),
+    "preflight": ("firmware_py", "the checklist before the car may be armed: bus, reports, signs, privileges, disk"),
     "emulate": ("sim", "the car alone: the plant emulator, on a bus in place of a vehicle"),
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "design", "guest")
+ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "guest")
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2
@@ -91,6 +92,8 @@ def _run(given: list[str]) -> int:
 def _become_process(name: str, arguments: list[str]) -> int:
     """Put the controller's or the plant's process in the place of this one; returns only if that fails."""
     environment = dict(os.environ)
+    if name == "preflight":
+        arguments = ["--preflight", *arguments]
     if name == "emulate":
         arguments, environment = _own_bus(arguments)
     # -P: a folder of the user's own called `sim` must not take the module's place.
