@@ -6,6 +6,9 @@ import os
 
 import pytest
 
+# As in tools/cli.py: small matrices, and the test workers share the cores already.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_sessionfinish(session: pytest.Session) -> None:

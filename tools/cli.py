@@ -11,10 +11,17 @@ from typing import NoReturn
 from firmware_py import errors as firmware_errors
 from sim import errors as sim_errors
 
+# The design's matrices are small: further BLAS threads would only wait for each other. Before anything loads numpy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 COMMANDS = {
     "demo": ("tools.demo", "the whole test: car and controller as processes of their own, judged by the examiner"),
     "operate": ("tools.operator_station", "the operator station alone: start, stop, emergency stop, clear by keys"),
     "design": ("tools.design_cmd", "make or check the controller's tables from vehicle and course files"),
+    "deploy": (
+        "tools.deploy.command",
+        "what goes into the car: the wheel of the controller alone, with its systemd units",
+    ),
     "guest": ("tools.guest.command", "run a command where a real vcan0 is, on any Linux on x86-64, without root"),
 }
 """Subcommand: (module with add_arguments(parser) and run(args) -> exit status, what it is for)."""
@@ -26,7 +33,7 @@ PROCESSES = {
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "guest")
+ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "deploy", "guest")
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2

@@ -119,9 +119,10 @@ def speed_limits(vehicle: Vehicle) -> SpeedLimits:
 def write_tables(report: DesignReport, out_dir: Path) -> None:
     """Write the tables of a design; the folder appears whole or stays as it was."""
     texts = table_texts(report)
-    out_dir.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out_dir.name}.", dir=out_dir.parent))
+    temporary: Path | None = None
     try:
+        out_dir.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{out_dir.name}.", dir=out_dir.parent))
         for name, text in texts.items():
             (temporary / name).write_text(text, encoding="ascii", newline="\n")
         temporary.chmod(0o755)
@@ -132,7 +133,8 @@ def write_tables(report: DesignReport, out_dir: Path) -> None:
         os.replace(temporary, out_dir)
         shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
         raise UserError(f"{out_dir}: tables cannot be written ({error.strerror})") from error
 
 
