@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test quick live design clean
+.PHONY: help install demo test quick live design wheel clean
 
 VENV := .venv
 STAMP := $(VENV)/.installed
@@ -14,6 +14,7 @@ help:
 	@echo "make demo     the car takes the test by itself, forward and in reverse (about 40 s); more: .venv/bin/parkctl demo --help"
 	@echo "make test     lint, format, types, all tests"
 	@echo "make design   makes the shipped tables anew from the vehicle and course files"
+	@echo "make wheel    builds dist/parkctl_controller-*.whl, the controller alone, for the car"
 	@echo "make install  .venv with everything in it (demo and test do this by themselves)"
 	@echo "make clean    removes .venv and what the tools cached"
 
@@ -43,6 +44,9 @@ demo: $(STAMP)
 
 design: $(STAMP)
 	@$(BIN)/parkctl design --update
+
+wheel: $(STAMP)
+	@$(BIN)/parkctl deploy wheel --out dist
 
 test: $(STAMP)
 	$(BIN)/ruff check .

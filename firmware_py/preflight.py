@@ -97,7 +97,7 @@ def check_link(bus: Bus) -> list[Check]:
 
 
 def _check_socketcan(channel: str, wanted: int, *, physical: bool) -> list[Check]:
-    up = f"ip link set {channel} up" if not physical else f"parkctl-can-up {channel} --bitrate {wanted}"
+    up = f"ip link set {channel} up" + (f" type can bitrate {wanted} restart-ms 100" if physical else "")
     folder = SYS_NET / channel
     try:
         flags = int((folder / "flags").read_text(), 16)
@@ -126,7 +126,7 @@ def _check_socketcan(channel: str, wanted: int, *, physical: bool) -> list[Check
         Check(
             "bit rate",
             bitrate == wanted,
-            f"{bitrate} bit/s" if bitrate == wanted else f"{bitrate} bit/s, must be {wanted}: {up}",
+            f"{bitrate} bit/s" if bitrate == wanted else f"{bitrate} bit/s, must be {wanted}: ip link set {channel} down, then {up}",
         ),
     ]
 

@@ -327,7 +327,7 @@ def test_vcan_has_no_bit_rate_and_needs_no_ip(net: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "kind", "answer", "bitrate", "line"),
     [
-        ("0x40080", "280", changed(), None, "interface: can0 is down: parkctl-can-up can0 --bitrate 500000"),
+        ("0x40080", "280", changed(), None, "interface: can0 is down: ip link set can0 up type can bitrate 500000 "),
         ("0x40081", "1", changed(), None, "interface: can0 is no CAN interface"),
         ("0x40081", "280", changed(bittiming={"bitrate": 250000}), None, "bit rate: 250000 bit/s, must be 500000: "),
         ("0x40081", "280", changed(), 250000, "bit rate: 500000 bit/s, must be 250000: "),

@@ -1,0 +1,1 @@
+"""What goes into the car: the controller's wheel, systemd units, the script that brings the CAN interface up."""
