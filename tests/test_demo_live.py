@@ -163,7 +163,8 @@ def test_an_interrupt_on_the_way_stops_the_car_first(tmp_path: Path, number: int
 def test_an_interrupt_before_the_car_drives(tmp_path: Path, after_s: float) -> None:
     demo = interrupted(tmp_path, None, after_s)
     status, error = demo.end()
-    assert status == 130
+    # Python ends by the signal itself where the interrupt fell into an exec() of some library; to a shell both are 130.
+    assert status in (130, -signal.SIGINT)
     assert error.count("\n") == 1
     assert "interrupted" in error
     assert not children_of(demo.process.pid)
@@ -280,7 +281,8 @@ def test_the_operators_keys_start_stop_and_clear(tmp_path: Path) -> None:
             wait_for("controller Active, Forward, None | vehicle Active, None, +")
             time.sleep(2.0)
             os.write(master, b" ")
-            wait_for("controller Fault, Forward, OperatorStop | vehicle Active, None, standstill")
+            wait_for("controller Fault, Forward, OperatorStop")
+            wait_for("standstill | pressed: stop")
             os.write(master, b"c")
             wait_for("controller Manual, Idle")
             os.write(master, b"q")
