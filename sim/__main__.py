@@ -285,6 +285,10 @@ def _open_bus(interface: str, channel: str | None, bitrate: int | None) -> "can.
     given |= {} if channel is None else {"channel": channel}
     given |= {} if bitrate is None else {"bitrate": bitrate}
     try:
+        if interface == "socketcan":
+            from sim.quick_socketcan import QuickSocketcanBus  # noqa: PLC0415
+
+            return QuickSocketcanBus(str(channel))
         return can.Bus(ignore_config=True, **given)
     except (can.CanError, ImportError, NotImplementedError, OSError, TypeError, ValueError) as error:
         text = " ".join(str(error).split())

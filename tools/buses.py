@@ -81,6 +81,10 @@ def open_bus(interface: str | None, channel: str | None, bitrate: int | None, *,
     given = {name: value for name, value in settings.items() if value is not None}
     name = " ".join(str(value) for value in (interface, channel) if value is not None) or "the configured bus"
     try:
+        if interface == "socketcan" and channel is not None:
+            from sim.quick_socketcan import QuickSocketcanBus  # noqa: PLC0415
+
+            return QuickSocketcanBus(channel)
         return can.Bus(ignore_config=ignore_settings, **given)  # type: ignore[arg-type]
     except OSError as error:
         if error.errno == errno.EAFNOSUPPORT:
