@@ -212,7 +212,7 @@ def open_bus(
     """
     import can  # noqa: PLC0415 -- heavy, and the tests of everything else do without it
 
-    logging.getLogger("can").setLevel(logging.ERROR)  # drivers also log what they raise; one line is enough
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # drivers also log what they raise; one line is enough
     options: dict[str, object] = {"interface": interface, "channel": channel, "bitrate": bitrate}
     options = {key: value for key, value in options.items() if value is not None}
     try:

@@ -2,7 +2,8 @@
 
 A report that comes much too seldom or too often (another cycle time, two senders) may still keep its timeout. As long
 as the controller is not responsible for a moving car, such a report is held back: to the control law it is missing, so
-the controller does not arm. While it drives only the timeouts count.
+the controller does not arm. Until every report has been timed VEH_Version is held back, which does the same. While the
+controller drives only the timeouts count.
 """
 
 from firmware_py.codec import INPUT_MESSAGES, MessageInfo
@@ -11,23 +12,27 @@ LEAST_SHARE = 0.7
 MOST_SHARE = 1.5
 """Bounds of the measured rate over the DBC's: a stall of 0.3 s in a second passes, half or twice the rate does not."""
 
+FIRST_PERIODS = 50
 WINDOW_PERIODS = 100
-LEAST_PERIODS = 50
-"""A rate is judged once a second, over at least half of one."""
+"""A report is timed over its first half second, then over every second."""
+
+JUDGE_PERIODS = 10
 
 Frame = tuple[int, bytes]
 
 
 class RateWatch:
-    """Counts the reports' frames; `held` names the ids held back at present and why."""
+    """Counts the reports' frames; `held` names the ids held back at present for their rate, and why."""
 
     def __init__(self, messages: dict[str, MessageInfo], period_ms: int) -> None:
         self._messages = tuple(messages[name] for name in INPUT_MESSAGES)
+        self._version_id = messages["VEH_Version"].frame_id
         self._period_ms = period_ms
         self._count = {message.frame_id: 0 for message in self._messages}
         self._begun = {message.frame_id: -1 for message in self._messages}  # period of the first frame, -1 without one
+        self._untimed = set(self._count)
         self._now = 0
-        self._judge_at = WINDOW_PERIODS
+        self._judge_at = JUDGE_PERIODS
         self.held: dict[int, str] = {}
 
     def sift(self, frames: list[Frame], periods: int, *, holding: bool) -> list[Frame]:
@@ -41,27 +46,29 @@ class RateWatch:
                 else:
                     count[arbitration_id] += 1
         if self._now >= self._judge_at:
-            self._judge_at = self._now + WINDOW_PERIODS
-            self._judge()
-        if holding and self.held:
-            return [frame for frame in frames if frame[0] not in self.held]
-        return frames
+            self._judge_at = self._now + JUDGE_PERIODS
+            for message in self._messages:
+                self._judge(message)
+        if not holding or not (self.held or self._untimed):
+            return frames
+        held = {*self.held, self._version_id} if self._untimed else self.held
+        return [frame for frame in frames if frame[0] not in held]
 
-    def _judge(self) -> None:
-        held = {}
-        for message in self._messages:
-            number = message.frame_id
-            count, periods = self._count[number], self._now - self._begun[number]
-            if self._begun[number] < 0:
-                continue
-            if periods < LEAST_PERIODS:
-                if number in self.held:
-                    held[number] = self.held[number]
-                continue
-            share = count * message.cycle_time_ms / (periods * self._period_ms)
-            if count and not LEAST_SHARE <= share <= MOST_SHARE:
-                every_ms = message.cycle_time_ms / share
-                held[number] = f"{message.name} comes every {every_ms:.1f} ms, must be {message.cycle_time_ms} ms"
-            self._count[number] = 0
-            self._begun[number] = self._now if count else -1
-        self.held = held
+    def _judge(self, message: MessageInfo) -> None:
+        number = message.frame_id
+        periods = self._now - self._begun[number]
+        if self._begun[number] < 0 or periods < (FIRST_PERIODS if number in self._untimed else WINDOW_PERIODS):
+            return
+        count, self._count[number] = self._count[number], 0
+        self._begun[number] = self._now
+        self.held.pop(number, None)
+        if count == 0:
+            # Silent: its timeout's business; once it is back it is timed anew.
+            self._begun[number] = -1
+            self._untimed.add(number)
+            return
+        self._untimed.discard(number)
+        share = count * message.cycle_time_ms / (periods * self._period_ms)
+        if not LEAST_SHARE <= share <= MOST_SHARE:
+            every_ms = message.cycle_time_ms / share
+            self.held[number] = f"{message.name} comes every {every_ms:.1f} ms, must be {message.cycle_time_ms} ms"

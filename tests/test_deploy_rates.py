@@ -9,6 +9,7 @@ from firmware_py.codec import INPUT_MESSAGES, load_codec
 from firmware_py.rates import RateWatch
 
 CODEC = load_codec(DEFAULT_DBC)
+VERSION = CODEC.messages["VEH_Version"].frame_id
 STEER = CODEC.messages["VEH_SteerRpt"].frame_id
 FRAME = (STEER, bytes(8))
 
@@ -23,19 +24,34 @@ def watch() -> RateWatch:
     return RateWatch(CODEC.messages, 10)
 
 
-def test_reports_at_their_cycle_times_pass(watch: RateWatch) -> None:
+@pytest.fixture
+def timed(watch: RateWatch) -> RateWatch:
+    """A watch to which every report has proved its rate."""
+    for cycle in range(110):
+        watch.sift(nominal(cycle), 1, holding=True)
+    return watch
+
+
+def test_reports_at_their_cycle_times_pass(timed: RateWatch) -> None:
     for cycle in range(1000):
         frames = nominal(cycle)
-        assert watch.sift(frames, 1, holding=True) == frames
-    assert watch.held == {}
+        assert timed.sift(frames, 1, holding=True) == frames
+    assert timed.held == {}
 
 
 @pytest.mark.parametrize("first", [0, 30, 60, 99, 130])
-def test_a_car_that_comes_late_is_not_held(watch: RateWatch, first: int) -> None:
+def test_a_car_is_timed_for_half_a_second_from_its_first_frame(watch: RateWatch, first: int) -> None:
+    """Meanwhile its version is not passed on, all the rest is."""
+    passed_from = None
     for cycle in range(400):
         frames = nominal(cycle) if cycle >= first else []
-        assert watch.sift(frames, 1, holding=True) == frames
+        passed = watch.sift(frames, 1, holding=True)
+        assert [frame for frame in passed if frame[0] != VERSION] == [f for f in frames if f[0] != VERSION]
+        if passed_from is None and VERSION in dict(passed):
+            passed_from = cycle
     assert watch.held == {}
+    assert passed_from is not None
+    assert first + 50 <= passed_from <= first + 80
 
 
 @pytest.mark.parametrize(
@@ -45,24 +61,30 @@ def test_a_car_that_comes_late_is_not_held(watch: RateWatch, first: int) -> None
         (1, 2, "VEH_SteerRpt comes every 5.0 ms, must be 10 ms"),
     ],
 )
-def test_a_report_of_another_rate_is_held_back_and_alone(watch: RateWatch, every: int, times: int, told: str) -> None:
+def test_a_report_of_another_rate_is_held_back_and_alone(timed: RateWatch, every: int, times: int, told: str) -> None:
     for cycle in range(400):
         others = [frame for frame in nominal(cycle) if frame[0] != STEER]
         frames = others + [FRAME] * (times if cycle % every == 0 else 0)
-        passed = watch.sift(frames, 1, holding=True)
-        if cycle > 200:
+        passed = timed.sift(frames, 1, holding=True)
+        if cycle > 220:
             assert passed == others
-    assert list(watch.held) == [STEER]
-    assert watch.held[STEER][:30] == told[:30]
-    assert watch.held[STEER].endswith("must be 10 ms")
+    assert timed.held == {STEER: told}
 
 
-def test_it_passes_again_once_it_keeps_its_time(watch: RateWatch) -> None:
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_wrong_rate_is_seen_before_the_first_arming(watch: RateWatch, every: int) -> None:
+    for cycle in range(300):
+        frames = [frame for frame in nominal(cycle) if frame[0] != STEER or cycle % every == 0]
+        passed = dict(watch.sift(frames, 1, holding=True))
+        assert not (STEER in passed and VERSION in passed), cycle
+
+
+def test_it_passes_again_once_it_keeps_its_time(timed: RateWatch) -> None:
     for cycle in range(250):
-        watch.sift([FRAME] if cycle % 2 == 0 else [], 1, holding=True)
-    assert watch.held
+        timed.sift([FRAME] if cycle % 2 == 0 else [], 1, holding=True)
+    assert timed.held
     for _ in range(210):
-        passed = watch.sift([FRAME], 1, holding=True)
+        passed = timed.sift([FRAME], 1, holding=True)
     assert passed == [FRAME]
 
 
@@ -87,3 +109,13 @@ def test_a_silent_report_is_left_to_its_timeout(watch: RateWatch) -> None:
     for _ in range(500):
         watch.sift([], 1, holding=True)
     assert watch.held == {}
+
+
+def test_who_comes_back_after_a_silence_is_timed_anew(timed: RateWatch) -> None:
+    for cycle in range(300):
+        timed.sift([frame for frame in nominal(cycle) if frame[0] != STEER], 1, holding=True)
+    since = 0
+    for cycle in range(300):
+        passed = dict(timed.sift(nominal(cycle), 1, holding=True))
+        since += VERSION not in passed and cycle % 10 == 0
+    assert since >= 5
