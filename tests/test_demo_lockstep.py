@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from PIL import Image
 
 from sim.body import clearance_m, outline_of
 from sim.data_files import FOLDERS, load_course, load_vehicle
-from tools import cli
+from tools import cli, lockstep
 from tools.figures import load_truth
 
 
@@ -79,7 +80,10 @@ def test_the_figures_agree_with_the_plants_truth() -> None:
     assert math.isclose(forward["max_speed_mps"], float(truth.speed_mps.max()))
 
 
-def test_a_car_that_stands_a_metre_off_does_not_start(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_car_that_stands_a_metre_off_does_not_start(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lockstep, "run_lockstep", partial(lockstep.run_lockstep, longest_s=3.0))
     scenario = (FOLDERS["scenario"] / "car.toml").read_text() + "\n[start]\nahead_m = -1.0\n"
     (here / "off.toml").write_text(scenario)
     figures = demo("--scenario", "off.toml", expected=1)
