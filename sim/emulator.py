@@ -453,11 +453,11 @@ class Emulator:
         faults = self._faults
         frames = faults.late(now_ns)
         for name, values in messages:
-            if faults.stops(name):
-                continue
             changed = dict(values)
             faults.alter(name, changed)
-            frame = faults.spoil(now_ns, name, self._wire.encode(name, changed))
+            # A stopped message is lost on the wire: its counter goes on, as a pair of LOC frames needs.
+            encoded = self._wire.encode(name, changed)
+            frame = None if faults.stops(name) else faults.spoil(now_ns, name, encoded)
             if frame is not None:
                 frames.append(frame)
         return frames

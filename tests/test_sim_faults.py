@@ -58,12 +58,12 @@ def ticks_without(bench: Listener, message: str) -> list[int]:
 
 
 def test_a_stopped_message_is_missing_for_its_time_and_the_others_are_not() -> None:
-    bench = Listener(world({"kind": "stop_message", "message": "VEH_LongRpt", "at_s": 0.1, "duration_s": 0.05}))
+    bench = Listener(world({"kind": "stop_message", "message": "VEH_LongRpt", "at_s": 0.1, "duration_s": 0.03}))
     bench.tick(30)
-    assert ticks_without(bench, "VEH_LongRpt") == [10, 11, 12, 13, 14]
+    assert ticks_without(bench, "VEH_LongRpt") == [10, 11, 12]
     for other in ("VEH_SysRpt", "VEH_SteerRpt", "VEH_MotionRpt", "LOC_Position", "LOC_Attitude"):
         assert ticks_without(bench, other) == []
-    assert "VEH_LongRpt" in bench.taken[15]  # pauses do not advance the counter
+    assert "VEH_LongRpt" in bench.taken[13]  # three lost frames are within what a receiver accepts
 
 
 def test_without_a_duration_it_stays() -> None:
