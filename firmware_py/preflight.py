@@ -126,7 +126,9 @@ def _check_socketcan(channel: str, wanted: int, *, physical: bool) -> list[Check
         Check(
             "bit rate",
             bitrate == wanted,
-            f"{bitrate} bit/s" if bitrate == wanted else f"{bitrate} bit/s, must be {wanted}: ip link set {channel} down, then {up}",
+            f"{bitrate} bit/s"
+            if bitrate == wanted
+            else f"{bitrate} bit/s, must be {wanted}: ip link set {channel} down, then {up}",
         ),
     ]
 

@@ -2,8 +2,8 @@
 
 A report that comes much too seldom or too often (another cycle time, two senders) may still keep its timeout. As long
 as the controller is not responsible for a moving car, such a report is held back: to the control law it is missing, so
-the controller does not arm. Until every report has been timed VEH_Version is held back, which does the same. While the
-controller drives only the timeouts count.
+the controller does not arm. While a report is being timed for the first time VEH_SysRpt is held back, which does the
+same. While the controller drives only the timeouts count.
 """
 
 from firmware_py.codec import INPUT_MESSAGES, MessageInfo
@@ -26,11 +26,11 @@ class RateWatch:
 
     def __init__(self, messages: dict[str, MessageInfo], period_ms: int) -> None:
         self._messages = tuple(messages[name] for name in INPUT_MESSAGES)
-        self._version_id = messages["VEH_Version"].frame_id
+        self._key_id = messages["VEH_SysRpt"].frame_id
         self._period_ms = period_ms
         self._count = {message.frame_id: 0 for message in self._messages}
         self._begun = {message.frame_id: -1 for message in self._messages}  # period of the first frame, -1 without one
-        self._untimed = set(self._count)
+        self._being_timed: set[int] = set()
         self._now = 0
         self._judge_at = JUDGE_PERIODS
         self.held: dict[int, str] = {}
@@ -43,31 +43,31 @@ class RateWatch:
             if arbitration_id in count:
                 if self._begun[arbitration_id] < 0:
                     self._begun[arbitration_id] = self._now  # the frame that opens a window is not of its rate
+                    self._being_timed.add(arbitration_id)
                 else:
                     count[arbitration_id] += 1
         if self._now >= self._judge_at:
             self._judge_at = self._now + JUDGE_PERIODS
             for message in self._messages:
                 self._judge(message)
-        if not holding or not (self.held or self._untimed):
+        if not holding or not (self.held or self._being_timed):
             return frames
-        held = {*self.held, self._version_id} if self._untimed else self.held
+        held = {*self.held, self._key_id} if self._being_timed else self.held
         return [frame for frame in frames if frame[0] not in held]
 
     def _judge(self, message: MessageInfo) -> None:
         number = message.frame_id
         periods = self._now - self._begun[number]
-        if self._begun[number] < 0 or periods < (FIRST_PERIODS if number in self._untimed else WINDOW_PERIODS):
+        if self._begun[number] < 0 or periods < (FIRST_PERIODS if number in self._being_timed else WINDOW_PERIODS):
             return
         count, self._count[number] = self._count[number], 0
         self._begun[number] = self._now
         self.held.pop(number, None)
+        self._being_timed.discard(number)
         if count == 0:
             # Silent: its timeout's business; once it is back it is timed anew.
             self._begun[number] = -1
-            self._untimed.add(number)
             return
-        self._untimed.discard(number)
         share = count * message.cycle_time_ms / (periods * self._period_ms)
         if not LEAST_SHARE <= share <= MOST_SHARE:
             every_ms = message.cycle_time_ms / share

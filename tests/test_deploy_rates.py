@@ -9,7 +9,7 @@ from firmware_py.codec import INPUT_MESSAGES, load_codec
 from firmware_py.rates import RateWatch
 
 CODEC = load_codec(DEFAULT_DBC)
-VERSION = CODEC.messages["VEH_Version"].frame_id
+SYS = CODEC.messages["VEH_SysRpt"].frame_id
 STEER = CODEC.messages["VEH_SteerRpt"].frame_id
 FRAME = (STEER, bytes(8))
 
@@ -41,13 +41,13 @@ def test_reports_at_their_cycle_times_pass(timed: RateWatch) -> None:
 
 @pytest.mark.parametrize("first", [0, 30, 60, 99, 130])
 def test_a_car_is_timed_for_half_a_second_from_its_first_frame(watch: RateWatch, first: int) -> None:
-    """Meanwhile its version is not passed on, all the rest is."""
+    """Meanwhile its state is not passed on, all the rest is."""
     passed_from = None
     for cycle in range(400):
         frames = nominal(cycle) if cycle >= first else []
         passed = watch.sift(frames, 1, holding=True)
-        assert [frame for frame in passed if frame[0] != VERSION] == [f for f in frames if f[0] != VERSION]
-        if passed_from is None and VERSION in dict(passed):
+        assert [frame for frame in passed if frame[0] != SYS] == [f for f in frames if f[0] != SYS]
+        if passed_from is None and SYS in dict(passed):
             passed_from = cycle
     assert watch.held == {}
     assert passed_from is not None
@@ -76,7 +76,7 @@ def test_a_wrong_rate_is_seen_before_the_first_arming(watch: RateWatch, every: i
     for cycle in range(300):
         frames = [frame for frame in nominal(cycle) if frame[0] != STEER or cycle % every == 0]
         passed = dict(watch.sift(frames, 1, holding=True))
-        assert not (STEER in passed and VERSION in passed), cycle
+        assert not (STEER in passed and SYS in passed), cycle
 
 
 def test_it_passes_again_once_it_keeps_its_time(timed: RateWatch) -> None:
@@ -117,5 +117,16 @@ def test_who_comes_back_after_a_silence_is_timed_anew(timed: RateWatch) -> None:
     since = 0
     for cycle in range(300):
         passed = dict(timed.sift(nominal(cycle), 1, holding=True))
-        since += VERSION not in passed and cycle % 10 == 0
+        since += SYS not in passed and cycle % 10 == 0
     assert since >= 5
+
+
+def test_an_operator_station_that_is_not_there_holds_nothing(watch: RateWatch) -> None:
+    """Else the reason shown would be the car's reports, not the operator's silence; it is timed once it comes."""
+    oper = CODEC.messages["OPER_Cmd"].frame_id
+    for cycle in range(300):
+        passed = dict(watch.sift([frame for frame in nominal(cycle) if frame[0] != oper], 1, holding=True))
+    assert SYS in passed
+    came = [SYS in dict(watch.sift(nominal(cycle), 1, holding=True)) for cycle in range(100)]
+    assert came[:50] == [False] * 50
+    assert came[80:] == [True] * 20
