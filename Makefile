@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test quick live design wheel clean
+.PHONY: help install demo test test-vcan quick live design wheel clean
 
 VENV := .venv
 STAMP := $(VENV)/.installed
@@ -13,6 +13,7 @@ TEST_WORKERS ?= 2
 help:
 	@echo "make demo     the car takes the test by itself, forward and in reverse (about 40 s); more: .venv/bin/parkctl demo --help"
 	@echo "make test     lint, format, types, all tests"
+	@echo "make test-vcan  only those on a real vcan0, in a guest kernel (2 min; once before: .venv/bin/parkctl guest --install)"
 	@echo "make design   makes the shipped tables anew from the vehicle and course files"
 	@echo "make wheel    builds dist/parkctl_controller-*.whl, the controller alone, for the car"
 	@echo "make install  .venv with everything in it (demo and test do this by themselves)"
@@ -60,6 +61,10 @@ quick: $(STAMP)
 # Real processes in wall-clock time: one at a time, or they would disturb each other.
 live: $(STAMP)
 	$(BIN)/pytest -m live
+
+# Part of `live` too, where the guest is installed.
+test-vcan: $(STAMP)
+	$(BIN)/pytest tests/test_vcan_live.py tests/test_vcan_mistakes.py
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks *.egg-info

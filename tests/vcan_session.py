@@ -1,0 +1,218 @@
+"""What the tests of the real vcan0 do inside the guest: one boot, three runs, all results as files in FOLDER.
+
+`python vcan_session.py FOLDER IDS`: IDS are the frame ids, in hexadecimal, that a replay feeds to the controller.
+Standard library only: every import costs its time again in the guest.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(sys.argv[1])
+FED_IDS = set(sys.argv[2].split(","))
+ROOT = Path(__file__).resolve().parent.parent
+BUS = ["-i", "socketcan", "-c", "vcan0"]
+ACTIVE = 2
+FORGED_EACH = 5
+ERROR_FRAMES = 4
+FED_AFTER_START_S = 9.0
+"""So long after the start button the recorded frames are fed."""
+SCREEN = (260, 110)
+
+figures: dict[str, Any] = {}
+
+
+def fifo(priority: int) -> Callable[[], None]:
+    def enter() -> None:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+    return enter
+
+
+def start(*command: object, priority: int | None = None, **files: Any) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [str(part) for part in command],
+        stdin=subprocess.DEVNULL,
+        preexec_fn=None if priority is None else fifo(priority),  # noqa: PLW1509
+        **files,
+    )
+
+
+def candump(name: str, *what: str) -> subprocess.Popen[bytes]:
+    """Record the bus, after everybody else: what waits is kept in a large buffer of the kernel."""
+    command = ["candump", "-r", "8000000", "-L", *(what or ["vcan0"])]
+    process = start(*command, priority=5, stdout=(FOLDER / name).open("wb"))
+    time.sleep(0.3)
+    return process
+
+
+def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM, limit_s: float = 20.0) -> int:
+    process.send_signal(number)
+    try:
+        return process.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def run(*command: str) -> None:
+    subprocess.run(command, check=True, stdin=subprocess.DEVNULL)
+
+
+class Controller:
+    """The controller's process alone, with its reports in a file."""
+
+    def __init__(self, name: str) -> None:
+        (FOLDER / name).mkdir()
+        self.said = FOLDER / name / "controller.jsonl"
+        self.process = start(
+            *(sys.executable, "-P", "-m", "firmware_py", *BUS, "--no-config", "--once", "--status"),
+            *("--realtime", "required", "--out", FOLDER / name),
+            stdout=self.said.open("wb"),
+            stderr=(FOLDER / name / "controller.txt").open("wb"),
+        )
+
+    def reports(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.said.read_text().splitlines()]
+
+    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
+        limit = time.monotonic() + limit_s
+        while time.monotonic() < limit and self.process.poll() is None:
+            reports = self.reports()
+            if reports and condition(reports[-1]):
+                return True
+            time.sleep(0.05)
+        return False
+
+
+def manoeuvre() -> None:
+    """The whole test by `parkctl demo`, with candump beside it."""
+    recorder = candump("candump.log")
+    began_s = time.monotonic()
+    demo = subprocess.run(
+        ["parkctl", "demo", *BUS, "--out", str(FOLDER / "run"), "--no-plots"],
+        capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    figures["demo"] = {"status": demo.returncode, "error": demo.stderr, "duration_s": time.monotonic() - began_s}
+    (FOLDER / "demo.txt").write_text(demo.stdout)
+    time.sleep(0.2)
+    end(recorder)
+
+
+def disturbances() -> None:
+    """Forged frames, error frames, load; at last the interface goes down and up while the car drives."""
+    recorder = candump("disturbed.log", "vcan0,0:0,#FFFFFFFF")
+    (FOLDER / "disturbed").mkdir()
+    car = start(
+        *(sys.executable, "-P", "-m", "sim", *BUS, "--out", FOLDER / "disturbed"),
+        stderr=(FOLDER / "disturbed/emulator.txt").open("wb"),
+    )
+    controller = Controller("disturbed_controller")
+    operator = start(
+        "parkctl", "operate", *BUS, "--auto", priority=10, stdout=(FOLDER / "disturbed/operate.txt").open("wb"),
+        stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    driving = controller.wait_for(lambda report: report.get("mode") == ACTIVE, 60.0)
+    time.sleep(2.0)
+    for _ in range(FORGED_EACH):
+        run("cansend", "vcan0", "101#DEADBEEFDEADBEEF")  # VEH_MotionRpt
+        run("cansend", "vcan0", "600#0000000000000000")  # LOC_Position
+    for _ in range(ERROR_FRAMES):
+        run("cansend", "vcan0", "20000004#0004000000000000")  # the controller of the bus: receive buffer overflow
+    began_s = time.monotonic()
+    run("cangen", "vcan0", "-I", "7A5", "-L", "8", "-D", "i", "-g", "5", "-n", "400")
+    figures["load_s"] = time.monotonic() - began_s
+    time.sleep(0.3)
+    before = controller.reports()[-1]
+    run("ip", "link", "set", "vcan0", "down")
+    figures["down_unix_s"] = time.time()
+    time.sleep(0.4)
+    run("ip", "link", "set", "vcan0", "up")
+    figures["up_unix_s"] = time.time()
+    end(recorder)
+    recorder = candump("after.log")  # candump itself does not survive that
+    try:
+        status: int | None = controller.process.wait(30.0)
+    except subprocess.TimeoutExpired:
+        status = None
+    figures["disturbed"] = {
+        "driving": driving,
+        "before": before,
+        "controller_status": status,
+        "final": controller.reports()[-1].get("final"),
+        "operator_status": end(operator, signal.SIGINT),
+        "emulator_status": end(car, signal.SIGINT),
+    }
+    end(recorder)
+
+
+def replay() -> None:
+    """The recorded frames of car, localisation and operator, fed by canplayer; cantools monitor on a terminal."""
+    fed = FOLDER / "fed.log"
+    begin_s = None
+    with fed.open("w") as file:
+        for line in (FOLDER / "run/bus.log").read_text().splitlines():
+            time_s, _, frame = line.split()
+            frame_id, _, data = frame.partition("#")
+            if frame_id not in FED_IDS:
+                continue
+            if begin_s is None and frame_id == "030" and int(data[2:4], 16) & 0x10:  # oper_start
+                begin_s = float(time_s[1:-1])
+            if begin_s is not None and float(time_s[1:-1]) > begin_s + FED_AFTER_START_S:
+                break
+            file.write(line + "\n")
+    recorder = candump("replayed.log")
+    controller = Controller("replayed")
+    screen, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", *SCREEN, 0, 0))
+    monitor = subprocess.Popen(
+        [Path(sys.executable).parent / "cantools", "monitor", *BUS, ROOT / "dbc/parking.dbc"],
+        stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True,
+        env=os.environ | {"TERM": "linux", "LINES": str(SCREEN[0]), "COLUMNS": str(SCREEN[1])},
+    )  # fmt: skip
+    reader = start(sys.executable, "-c", COPY, FOLDER / "screen.txt", pass_fds=[screen], env={"FD": str(screen)})
+    ready = controller.wait_for(lambda report: True, 30.0)
+    time.sleep(4.0)  # the monitor loads
+    player = start("canplayer", "-I", fed, priority=75)
+    status = player.wait()
+    end(controller.process, signal.SIGKILL)  # it would wait for a car to stand that is not there
+    figures["replay"] = {"ready": ready, "player_status": status}
+    os.write(screen, b"q")
+    try:
+        figures["replay"]["monitor_status"] = monitor.wait(20.0)
+    except subprocess.TimeoutExpired:
+        monitor.kill()
+    end(reader)
+    end(recorder)
+
+
+COPY = """
+import os, sys
+with open(sys.argv[1], "wb") as file:
+    try:
+        while True:
+            file.write(os.read(int(os.environ["FD"]), 65536))
+            file.flush()
+    except OSError:
+        pass  # the other end is closed
+"""
+
+
+if __name__ == "__main__":
+    for step in (manoeuvre, disturbances, replay):
+        began_s = time.monotonic()
+        step()
+        figures[f"{step.__name__}_s"] = time.monotonic() - began_s
+        (FOLDER / "session.json").write_text(json.dumps(figures, indent=2))
