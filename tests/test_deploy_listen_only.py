@@ -20,7 +20,7 @@ from firmware_py.__main__ import DEFAULT_DBC, DEFAULT_TABLES, build_parser, main
 from firmware_py.bus import Bus, open_bus
 from firmware_py.codec import INPUT_MESSAGES, Sender, load_codec
 from firmware_py.core.controller import PERIOD_S
-from firmware_py.core.signals import SteerCommand, SysReport
+from firmware_py.core.signals import MotionReport, SteerCommand, SysReport
 from firmware_py.core.tables import Tables
 from firmware_py.errors import UserError
 from firmware_py.node import build_tables
@@ -89,7 +89,7 @@ def test_the_process_computes_and_logs_and_the_bus_stays_silent(open_node: Open,
         sender = Sender(CODEC)
         end_s = time.monotonic() + 0.3
         while time.monotonic() < end_s:
-            witness.send(plain(*sender.pack("VEH_SysRpt", SysReport(1, 0, 0, 0, 0, 0, 0))))
+            witness.send(plain(*sender.pack("VEH_MotionRpt", MotionReport(0.0, 0.0, 1, 1))))
             witness.send(plain(*sender.pack("CTRL_SteerCmd", SteerCommand(0.1, 1))))
             time.sleep(0.01)
         child.send_signal(signal.SIGTERM)
