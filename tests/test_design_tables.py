@@ -16,7 +16,7 @@ from tools.design import tables
 
 @pytest.fixture(scope="module")
 def report():
-    return tables.run_design(load_vehicle("paper"), load_course("ohio"))
+    return tables.run_design(load_vehicle("paper"), load_course("ohio"), tables.recorded_numbers(TABLES))
 
 
 @pytest.mark.parametrize(("vehicle", "course"), tables.SHIPPED)
@@ -56,7 +56,7 @@ def test_another_car_of_the_same_name_has_no_shipped_tables(tmp_path):
     assert tables.tables_folder(load_vehicle(file), course) is None
     overlaid = load_vehicle("paper", load_scenario("ideal").vehicle_overlay)
     assert tables.tables_folder(overlaid, course) is None
-    assert tables.tables_folder(load_vehicle("paper"), load_course("paper")) is None
+    assert tables.tables_folder(load_vehicle("fusion"), load_course("paper")) is None
 
 
 def test_every_kind_of_change_is_found(report, tmp_path):

@@ -55,7 +55,8 @@ def _shipped(options: argparse.Namespace) -> int:
             all_figures.append(_design(vehicle, course, folder))
             continue
         stale = tables.stale_inputs(folder, vehicle, course)
-        report = tables.run_design(vehicle, course)
+        # The search is not made again: another machine's rounding would end it at another optimum, equally good.
+        report = tables.run_design(vehicle, course, tables.recorded_numbers(folder))
         found = [f"stale: {what} has changed since" for what in stale]
         found += tables.differences(tables.table_texts(report), folder)
         for line in found:

@@ -74,12 +74,17 @@ def sample(fit: FitResult, step_m: float = GRID_M) -> Path:
     )
 
 
-def coarse(fit: FitResult, per_segment: int) -> Geometry:
-    """Points at equal steps of lambda, shape (m * per_segment,), the joints' doubles left out; for the optimiser."""
-    m = len(fit.length_m)
-    segment = np.repeat(np.arange(m), per_segment)
-    lambda_ = np.tile(np.arange(per_segment) / (per_segment - 1.0), m)
-    return geometry(fit, segment, lambda_)
+def coarse(fit: FitResult, step_m: float) -> Geometry:
+    """Points at equal steps of the waypoints' parameter over the whole path, then the joints; for the optimiser.
+
+    Steps are equal over all segments: with a number of points a segment, a search would soon hide a cone between two
+    points of a long one. At the joints the curvature's slope has its peaks.
+    """
+    border = np.concatenate([[0.0], np.cumsum(fit.length_m)])
+    even = np.linspace(0.0, border[-1], max(2, math.ceil(border[-1] / step_m) + 1))
+    parameter = np.concatenate([even, border[1:-1]])
+    segment = np.clip(np.searchsorted(border, parameter, side="right") - 1, 0, len(fit.length_m) - 1)
+    return geometry(fit, segment, (parameter - border[segment]) / fit.length_m[segment])
 
 
 def mirrored(path: Path) -> Path:

@@ -10,6 +10,7 @@ The minimiser is found in the null space of the constraints (no iteration, no pe
 level of rounding.
 """
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +47,14 @@ def derivative_row(order: int, lambda_: float, p: int) -> Floats:
     return row
 
 
+@cache
+def _derivatives(lambda_: float, p: int) -> Floats:
+    """All derivatives at one point: row k gives the k-th; shape (p + 1, p + 1), not to be written to."""
+    table = np.array([derivative_row(order, lambda_, p) for order in range(p + 1)])
+    table.flags.writeable = False
+    return table
+
+
 def fit_path(
     waypoints: DenseWaypoints,
     *,
@@ -67,39 +76,41 @@ def fit_path(
     length_m = waypoints.parameter_m[:, -1] - waypoints.parameter_m[:, 0]
     scale = length_m if length_scaled else np.ones(m)
 
-    rows: list[Floats] = []
-    values: list[Floats] = []
-
-    def add(parts: list[tuple[int, Floats]], value: Floats) -> None:
-        row = np.zeros(unknowns)
-        for segment, part in parts:
-            row[segment * (p + 1) : (segment + 1) * (p + 1)] = part
-        rows.append(row)
-        values.append(value)
-
-    nothing = np.zeros(2)
-    for joint in range(m - 1):
-        for order in range(q + 1):
-            left = derivative_row(order, 1.0, p) / scale[joint] ** order
-            right = derivative_row(order, 0.0, p) / scale[joint + 1] ** order
-            add([(joint, left), (joint + 1, -right)], nothing)
-    for segment, lambda_, pin in ((0, 0.0, start), (m - 1, 1.0, stop)):
-        for order, value in enumerate(pin if pin is not None else ()):
-            # A pin is a derivative along the path, whatever the joints are scaled by.
-            add([(segment, derivative_row(order, lambda_, p) / length_m[segment] ** order)], np.asarray(value))
-    gamma = np.array(rows).reshape(len(rows), unknowns)
-    target = np.array(values).reshape(len(rows), 2)
-    if len(rows) >= unknowns:
+    begin, end = _derivatives(0.0, p), _derivatives(1.0, p)
+    pinned = [
+        (segment, table, np.asarray(pin))
+        for segment, table, pin in ((0, begin, start), (m - 1, end, stop))
+        if pin is not None
+    ]
+    joints = (m - 1) * (q + 1)
+    conditions = joints + sum(len(pin) for _, _, pin in pinned)
+    if max([q, *(len(pin) - 1 for _, _, pin in pinned)]) > p:
+        raise UserError(f"path fit: a condition on a derivative that order p = {p} does not have; raise p")
+    if conditions >= unknowns:
         raise UserError(
-            f"path fit: {len(rows)} conditions on {unknowns} coefficients; raise the order p = {p} or lower q = {q}"
+            f"path fit: {conditions} conditions on {unknowns} coefficients; raise the order p = {p} or lower q = {q}"
         )
+    rows_of = np.zeros((conditions, m, p + 1))
+    target = np.zeros((conditions, 2))
+    order = np.arange(p + 1)
+    for joint in range(m - 1):
+        rows = slice(joint * (q + 1), (joint + 1) * (q + 1))
+        rows_of[rows, joint] = end[: q + 1] / (scale[joint] ** order[: q + 1])[:, None]
+        rows_of[rows, joint + 1] = -begin[: q + 1] / (scale[joint + 1] ** order[: q + 1])[:, None]
+    row = joints
+    for segment, table, pin in pinned:
+        # A pin is a derivative along the path, whatever the joints are scaled by.
+        count = len(pin)
+        rows_of[row : row + count, segment] = table[:count] / (length_m[segment] ** order[:count])[:, None]
+        target[row : row + count] = pin
+        row += count
+    gamma = rows_of.reshape(conditions, unknowns)
 
     share = (waypoints.parameter_m - waypoints.parameter_m[:, :1]) / length_m[:, None]
-    phi = np.zeros((m * n, unknowns))
+    powers = np.zeros((m, n, m, p + 1))
     for segment in range(m):
-        phi[segment * n : (segment + 1) * n, segment * (p + 1) : (segment + 1) * (p + 1)] = np.vander(
-            share[segment], p + 1, increasing=True
-        )
+        powers[segment, :, segment] = np.vander(share[segment], p + 1, increasing=True)
+    phi = powers.reshape(m * n, unknowns)
     measured = np.stack([waypoints.x_m.ravel(), waypoints.y_m.ravel()], axis=1)
     theta = _least_squares(phi, measured, gamma, target)
     residual = float(np.max(np.abs(gamma @ theta - target), initial=0.0))
@@ -112,8 +123,6 @@ def _least_squares(phi: Floats, measured: Floats, gamma: Floats, target: Floats)
     if not len(gamma):
         return np.asarray(np.linalg.lstsq(phi, measured, rcond=None)[0])
     weight = np.linalg.norm(gamma, axis=1)
-    if np.any(weight == 0.0):
-        raise UserError("path fit: a condition on a derivative that the polynomial does not have; raise the order p")
     rows, values = gamma / weight[:, None], target / weight[:, None]
     count = len(rows)
     basis, upper = np.linalg.qr(rows.T, mode="complete")

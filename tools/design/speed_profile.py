@@ -51,11 +51,10 @@ def station_limit(path: Path, wheelbase_m: float, limits: SpeedLimits) -> Floats
     return np.asarray(np.minimum(np.minimum(lateral, steering), limits.speed_mps))
 
 
-def plan_speed(path: Path, wheelbase_m: float, limits: SpeedLimits, direction: int, every: int = 4) -> SpeedProfile:
+def plan_speed(path: Path, wheelbase_m: float, limits: SpeedLimits, direction: int) -> SpeedProfile:
     """Fastest profile within the limits for one leg, from and to standstill.
 
-    path: the forward path; direction -1 rides it backwards, stations then count from the forward leg's end. every: the
-    optimisation works on every so-many-th station (0.04 m at the usual grid) and is interpolated between.
+    path: the forward path; direction -1 rides it backwards, stations then count from the forward leg's end.
     The firmware needs a speed above zero to leave a station at all, so speeds below the floor are raised to it; the
     stop itself is the controller's. Raises UserError where the limits force a speed below the floor on the way.
     """
@@ -64,46 +63,36 @@ def plan_speed(path: Path, wheelbase_m: float, limits: SpeedLimits, direction: i
         where = float(path.station_m[int(cap.argmin())])
         raise UserError(
             f"speed profile: at station {where:.2f} m the steering rate limit {limits.road_wheel_rate_radps:.3g} rad/s"
-            f" (from max_road_wheel_rate_radps) allows {cap.min():.3f} m/s, below the floor of {limits.floor_mps:g} m/s"
+            f" (from max_road_wheel_rate_radps) allows {cap.min():.3f} m/s, less than the floor of"
+            f" {limits.floor_mps:g} m/s"
         )
     if direction < 0:
         cap = cap[::-1]
-    count = len(cap) - 1
-    cells = max(8, round(count / every))
-    station = np.linspace(0.0, path.length_m, cells + 1)
-    # A coarse station stands for its neighbourhood: take the lowest limit there.
-    reach = path.length_m / cells
-    coarse_cap = np.array([cap[np.abs(path.station_m - s) <= reach].min() for s in station])
-    b = _optimise(coarse_cap, reach, limits)
-    # Acceleration is linear between the middles of the cells, so the jerk stays what the programme limited.
-    middle = 0.5 * (station[1:] + station[:-1])
-    planned = np.interp(path.station_m, middle, 0.5 * np.diff(b) / reach)
-    energy = np.concatenate([[0.0], np.cumsum((planned[1:] + planned[:-1]) * path.step_m)])
-    energy -= energy[-1] * path.station_m / path.length_m
-    energy = np.clip(energy, 0.0, cap * cap)
+    # No ride from rest without a step of the acceleration is faster than v = j t^2 / 2. It ends with a step: the
+    # controller's brake stops the car from a speed at which the drive cannot be felt any more.
+    from_rest = 0.5 * limits.jerk_mps3 * np.cbrt(6.0 * path.station_m / limits.jerk_mps3) ** 2
+    energy = _optimise(np.minimum(cap, from_rest), path.step_m, limits)
     speed = np.maximum(np.sqrt(energy), limits.floor_mps)
-    accel = np.clip(planned, -limits.accel_x_mps2, limits.accel_x_mps2)
-    accel[speed <= limits.floor_mps] = 0.0
+    accel = np.gradient(0.5 * energy, path.step_m)
+    accel[np.sqrt(energy) <= limits.floor_mps] = 0.0
     duration = float(np.sum(path.step_m / (0.5 * (speed[1:] + speed[:-1]))))
     return SpeedProfile(path.station_m, speed, accel, duration)
 
 
-def _optimise(cap_mps: Floats, step_m: float, limits: SpeedLimits, rounds: int = 6) -> Floats:
+def _optimise(cap_mps: Floats, step_m: float, limits: SpeedLimits, rounds: int = 8) -> Floats:
     """Largest sum of b = v^2 within cap, acceleration and jerk limits; zero at both ends."""
     from scipy.optimize import linprog  # noqa: PLC0415
     from scipy.sparse import diags_array, vstack  # noqa: PLC0415
 
     n = len(cap_mps)
-    # Speed is reached on the way from the floor; ends rest.
     upper = cap_mps * cap_mps
     upper[0] = upper[-1] = 0.0
     first = diags_array([-np.ones(n - 1), np.ones(n - 1)], offsets=[0, 1], shape=(n - 1, n))
     second = diags_array([np.ones(n - 2), -2.0 * np.ones(n - 2), np.ones(n - 2)], offsets=[0, 1, 2], shape=(n - 2, n))
     accel = np.full(n - 1, 2.0 * limits.accel_x_mps2 * step_m)
-    around = np.full(n, limits.speed_mps**2)
+    around = np.maximum(upper, limits.floor_mps**2)
     b = np.zeros(n)
     bounds = np.stack([np.zeros(n), upper], axis=1)
-    floor = limits.floor_mps**2
     for _ in range(rounds):
         # |b''| <= 2 j / sqrt(b), tangent at `around`: 2 j / sqrt(a) (1.5 - 0.5 b / a)
         rate = 2.0 * limits.jerk_mps3 * step_m**2 / np.sqrt(around[1:-1])
@@ -113,10 +102,10 @@ def _optimise(cap_mps: Floats, step_m: float, limits: SpeedLimits, rounds: int =
         answer = linprog(-np.ones(n), A_ub=matrix, b_ub=side, bounds=bounds, method="highs")
         if answer.status != 0:  # pragma: no cover  (b = 0 always satisfies the programme)
             raise UserError(f"speed profile: no solution within the limits ({answer.message})")
-        done = np.max(np.abs(answer.x - b)) < 1e-6
-        b = np.maximum(answer.x, 0.0)
-        around = np.maximum(b, floor)
-        if done:
+        gain = float(np.max(np.abs(answer.x - b)))
+        b = np.minimum(np.maximum(answer.x, 0.0), upper)
+        around = np.maximum(b, limits.floor_mps**2)
+        if gain < 1e-4:
             break
     return np.asarray(b)
 

@@ -25,7 +25,7 @@ FORMAT = 1
 ROOT = Path(__file__).resolve().parent.parent.parent
 DBC_FOLDER = ROOT / "dbc"
 SHIPPED_FOLDER = ROOT / "firmware_py" / "tables"
-SHIPPED = (("paper", "ohio"), ("fusion", "ohio"))
+SHIPPED = (("paper", "ohio"), ("fusion", "ohio"), ("paper", "paper"))
 """Vehicles and courses whose tables come with the project."""
 
 SOURCES = ("waypoints", "path_fit", "path", "optimise", "speed_profile", "model", "gains", "tables")
@@ -35,8 +35,10 @@ SOURCES = ("waypoints", "path_fit", "path", "optimise", "speed_profile", "model"
 # accelerations; jerk and the share of the steering rate are this design's, for comfort and for feedback.
 MAX_SPEED_MPS = 1.0
 MAX_ACCEL_G = 0.05
-PLANNED_SHARE = 0.85
-"""Share of the longitudinal acceleration that is planned; the rest is for following."""
+PLANNED_SPEED_SHARE = 0.98
+PLANNED_SHARE = 0.80
+"""Shares of the speed and of the accelerations that are planned; the rest is for following: with nothing left, a car
+that is behind its profile would start to brake late."""
 MAX_JERK_MPS3 = 0.5
 MAX_STEER_RATE_RADPS = 0.45
 STEER_RATE_SHARE = 0.75
@@ -90,9 +92,21 @@ def stale_inputs(folder: Path, vehicle: Vehicle, course: Course) -> list[str]:
     return stale
 
 
-def run_design(vehicle: Vehicle, course: Course) -> DesignReport:
-    """Design path, speed and gains. Raises UserError where the car cannot do the course, and says why."""
-    design = optimise_path(vehicle, course)
+def recorded_numbers(folder: Path) -> tuple[float, ...] | None:
+    """Return the numbers of the search that the tables of a folder were made from; None where it does not tell."""
+    try:
+        numbers = tomllib.loads((folder / "manifest.toml").read_text(encoding="ascii"))["path_numbers"]
+        return tuple(float(number) for number in numbers)
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+        return None
+
+
+def run_design(vehicle: Vehicle, course: Course, numbers: tuple[float, ...] | None = None) -> DesignReport:
+    """Design path, speed and gains. Raises UserError where the car cannot do the course, and says why.
+
+    numbers: those of an earlier search for the path, to make the same tables again; None searches.
+    """
+    design = optimise_path(vehicle, course, numbers=numbers)
     limits = speed_limits(vehicle)
     profiles = tuple(plan_speed(design.path, vehicle.wheelbase_m, limits, direction) for direction in (1, -1))
     return DesignReport(vehicle, course, design, (profiles[0], profiles[1]), design_gains(vehicle))
@@ -106,9 +120,9 @@ def design_tables(vehicle: Vehicle, course: Course, out_dir: Path) -> DesignRepo
 
 
 def speed_limits(vehicle: Vehicle) -> SpeedLimits:
-    """Return the limits of the ride for a car."""
+    """Return the limits that the ride is planned within for a car."""
     return SpeedLimits(
-        speed_mps=min(MAX_SPEED_MPS, vehicle.max_speed_mps),
+        speed_mps=PLANNED_SPEED_SHARE * min(MAX_SPEED_MPS, vehicle.max_speed_mps),
         accel_x_mps2=PLANNED_SHARE * MAX_ACCEL_G * GRAVITY_MPS2,
         accel_y_mps2=PLANNED_SHARE * MAX_ACCEL_G * GRAVITY_MPS2,
         jerk_mps3=MAX_JERK_MPS3,
@@ -200,7 +214,7 @@ def _car_text(vehicle: Vehicle) -> str:
     lines += [
         f"{name} = {round(getattr(vehicle, name))}" for name in ("pose_latency_samples", "command_latency_samples")
     ]
-    lines.append(f"max_speed_mps = {speed_limits(vehicle).speed_mps!r}")
+    lines.append(f"max_speed_mps = {min(MAX_SPEED_MPS, vehicle.max_speed_mps)!r}")
     lines.append(f"controlled_decel_mps2 = {CONTROLLED_DECEL_MPS2!r}")
     lines.append(f"emergency_decel_mps2 = {min(EMERGENCY_DECEL_MPS2, vehicle.max_decel_mps2)!r}")
     return "\n".join(lines) + "\n"
@@ -216,6 +230,7 @@ def _manifest_text(report: DesignReport, texts: dict[str, str]) -> str:
         f"vehicle_hash24 = {vehicle.hash24}",
         f'course_sha256 = "{course_sha256(course)}"',
         f'design_sha256 = "{design_sha256()}"',
+        f"path_numbers = {list(report.design.numbers)!r} # what the search found; --check starts from them",
         "",
         "[inputs] # files under dbc/ that the firmware compares where it finds them",
     ]
@@ -260,6 +275,10 @@ def shipped_pairs(vehicle: str | None = None, course: str | None = None) -> list
     ]
 
 
+LEAST_DIFFERENCE = 1e-10
+"""Difference, in the unit of any column, that is never more than rounding."""
+
+
 def differences(made: dict[str, str], folder: Path, relative: float = 1e-9) -> list[str]:
     """Return, a line each, where the tables of a folder differ from texts made now by more than rounding."""
     found = []
@@ -286,7 +305,7 @@ def _nearly_equal(new: str, old: str, relative: float) -> bool:
         pairs = [(float(a), float(b)) for a, b in zip(new.split(","), old.split(","), strict=True)]
     except ValueError:
         return False
-    return all(abs(a - b) <= relative * max(abs(a), abs(b)) + 1e-12 for a, b in pairs)
+    return all(abs(a - b) <= relative * max(abs(a), abs(b)) + LEAST_DIFFERENCE for a, b in pairs)
 
 
 def as_json(report: DesignReport, certificate: Any) -> dict[str, Any]:

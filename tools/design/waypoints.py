@@ -1,8 +1,8 @@
 """From a few waypoints to many: modified Akima interpolation, as the paper generates its waypoints.
 
-The few waypoints lie on the start's straight line (two), in the middle of the lane change (one) and on the stop's
-straight line (two), with the start and the stop pose at the ends: five numbers shape the path, three more cut it into
-segments. All lengths in m, angles in rad, in the course frame (x ahead, y left).
+Of six waypoints, two are the start and the stop pose, one more lies on the straight line of each; between them lie the
+swing that begins the lane change and the middle of it: four numbers shape the path, three more cut it into segments.
+All lengths in m, angles in rad, in the course frame (x ahead, y left).
 """
 
 import math
@@ -16,6 +16,12 @@ from sim.errors import UserError
 
 MIN_WAYPOINTS = 4
 """Fewer leave no room for a turn and a counter-turn between two straight ends."""
+
+CALM_SHARE = 0.4
+"""Share of the way to the swing at which the start's straight line gets a waypoint."""
+
+JOIN_SHARE = 0.03
+"""Share of the way to the stop, before it, at which the stop's straight line gets a waypoint."""
 
 Floats = NDArray[np.float64]
 
@@ -87,21 +93,20 @@ def interpolate(waypoints: Waypoints, per_segment: int = 41) -> DenseWaypoints:
 def turn_waypoints(
     start: tuple[float, float, float],
     stop: tuple[float, float, float],
-    turn_in_m: float,
-    turn_out_m: float,
+    swing: tuple[float, float],
     middle: tuple[float, float],
-    guard_m: tuple[float, float],
     split_x_m: tuple[float, ...],
 ) -> Waypoints:
     """Waypoints of one lane change between two poses (x, y, yaw).
 
-    The turn begins at x = `turn_in_m` on the start's straight line and ends at x = `turn_out_m` on the stop's; `middle`
-    is the waypoint between. `guard_m` are the distances before the turn and after it of one more waypoint each on the
-    straight lines: the further away, the softer makima leaves and meets the straight.
+    `swing` is where the turn begins: x, and how far it lies to the left of the start's straight line; a little to the
+    right, away from the turn, makes room for the body's inner side. `middle` is (x, y) of the waypoint on the way to
+    the stop's straight line, which is joined 3 % of the distance before the stop.
     """
-    xa, xb = turn_in_m, turn_out_m
+    calm_m = start[0] + CALM_SHARE * (swing[0] - start[0])
+    joined_m = stop[0] - JOIN_SHARE * (stop[0] - start[0])
     slope_a, slope_b = math.tan(start[2]), math.tan(stop[2])
-    x = (start[0], xa - guard_m[0], xa, middle[0], xb, xb + guard_m[1], stop[0])
-    y_a = [start[1] + slope_a * (x_m - start[0]) for x_m in x[:3]]
-    y_b = [stop[1] + slope_b * (x_m - stop[0]) for x_m in x[4:]]
-    return Waypoints(x, (*y_a, middle[1], *y_b), split_x_m, start[2], stop[2])
+    x = (start[0], calm_m, swing[0], middle[0], joined_m, stop[0])
+    calm, turn = (start[1] + slope_a * (x_m - start[0]) for x_m in x[1:3])
+    y = (start[1], calm, turn + swing[1], middle[1], stop[1] + slope_b * (joined_m - stop[0]), stop[1])
+    return Waypoints(x, y, split_x_m, start[2], stop[2])
