@@ -12,7 +12,7 @@ from firmware_py.core import conditions as c
 from firmware_py.core import gate as last_gate
 from firmware_py.core import health, limits, manoeuvre, observer, pid, predictor, speed, supervisor
 from firmware_py.core.motion import PathState
-from firmware_py.core.path import PathPoint, locate
+from firmware_py.core.path import feedforward_at
 from firmware_py.core.schedule import Gains, gains_at
 from firmware_py.core.signals import (
     GEAR_NONE,
@@ -122,10 +122,11 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         ahead = _unpredicted(observed.path, ahead.station_m)
 
     # Steering: feedforward + PID - disturbance, within the limits.
-    at = locate(leg, ahead.station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
+    feedforward_1pm, slope_1pm2 = feedforward_at(leg, ahead.station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
     wanted_rad = _steering(
         car,
-        at,
+        feedforward_1pm,
+        slope_1pm2,
         ahead.cross_track_error_m,
         ahead.heading_error_rad,
         ahead.curvature_disturbance_1pm,
@@ -276,7 +277,8 @@ def _unpredicted(path: PathState, station_m: float) -> PathState:
 
 def _steering(
     car: CarTable,
-    at: PathPoint,
+    feedforward_1pm: float,
+    slope_1pm2: float,
     cross_track_error_m: float,
     heading_error_rad: float,
     disturbance_1pm: float,
@@ -286,10 +288,10 @@ def _steering(
     travel_mps: float,
 ) -> float:
     """Return the wanted road-wheel angle: feedforward, less feedback and disturbance, ahead of the actuator's lag."""
-    reference = car.wheelbase_m * at.feedforward_curvature_1pm
+    reference = car.wheelbase_m * feedforward_1pm
     feedback_1pm = pid.feedback_1pm(cross_track_error_m, heading_error_rad, integral_m2, gains, sigma)
     angle_rad = math.atan(reference - car.wheelbase_m * (feedback_1pm + disturbance_1pm))
-    rate_radps = travel_mps * car.wheelbase_m * at.feedforward_slope_1pm2 / (1.0 + reference * reference)
+    rate_radps = travel_mps * car.wheelbase_m * slope_1pm2 / (1.0 + reference * reference)
     return angle_rad + car.steering_lag_s * rate_radps
 
 

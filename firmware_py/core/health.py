@@ -225,6 +225,7 @@ def assess(
         pose_is_new=pose_is_new_flag,
     )
 
+    sys, steer, long, oper = inputs.sys, inputs.steer, inputs.long, inputs.oper
     sys_lost = ages.sys_us >= timeouts.sys_us
     steer_lost = ages.steer_us >= timeouts.steer_us
     motion_lost = ages.motion_us >= timeouts.motion_us
@@ -233,7 +234,7 @@ def assess(
     pose_poor = inputs.position.position_quality != QUALITY_FIXED or inputs.attitude.yaw_quality != QUALITY_FIXED
     oper_lost = ages.oper_us >= timeouts.oper_us
     version_lost = ages.version_us >= timeouts.version_us
-    standstill = not motion_lost and not long_lost and inputs.long.standstill != 0 and abs(speed_mps) < STANDSTILL_MPS
+    standstill = not motion_lost and not long_lost and long.standstill != 0 and abs(speed_mps) < STANDSTILL_MPS
     away_from_start = (
         abs(believed.cross_track_error_m) > START_POSITION_M
         or abs(believed.station_m) > START_POSITION_M
@@ -243,49 +244,76 @@ def assess(
     over_speed = abs(speed_mps) > OVER_SPEED_SHARE * car.max_speed_mps + OVER_SPEED_MPS
     overrun = overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET
 
-    present = (
-        c.bit(c.WAITING_FOR_REPORTS, sys_lost or steer_lost or motion_lost or long_lost or pose_lost or version_lost)
-        | c.bit(c.WAITING_FOR_OPERATOR, oper_lost)
-        | c.bit(c.DBC_HASH_MISMATCH, not version_lost and inputs.version.veh_dbc_hash != tables.dbc_hash24)
-        | c.bit(c.VEHICLE_HASH_MISMATCH, not version_lost and inputs.version.veh_vehicle_hash != tables.vehicle_hash24)
-        | c.bit(c.POSE_NOT_AT_START, away_from_start)
-        | c.bit(c.POSE_SETTLING, believed.averaged < SETTLED_POSES)
-        | c.bit(c.NOT_AT_STANDSTILL, not standstill)
-        | c.bit(c.STANDSTILL, standstill)
-        | c.bit(c.VEHICLE_NOT_READY, inputs.sys.vehicle_state != MODE_READY)
-        | c.bit(c.VEHICLE_ACTIVE, not sys_lost and inputs.sys.vehicle_state == MODE_ACTIVE)
-        | c.bit(c.OPERATOR_STOP, inputs.oper.oper_stop != 0)
-        | c.bit(c.EMERGENCY_STOP, inputs.oper.oper_estop != 0)
-        | c.bit(
-            c.DRIVER_OVERRIDE,
-            inputs.sys.driver_override != 0 or inputs.steer.steer_override != 0 or inputs.long.brake_override != 0,
-        )
-        | c.bit(
-            c.VEHICLE_FAULT,
-            inputs.sys.vehicle_state == MODE_FAULT
-            or inputs.steer.steer_fault != 0
-            or inputs.long.long_fault != 0
-            or (active and not sys_lost and inputs.sys.vehicle_state != MODE_ACTIVE),
-        )
-        | c.bit(c.SYS_REPORT_TIMEOUT, sys_lost)
-        | c.bit(c.STEER_REPORT_TIMEOUT, steer_lost)
-        | c.bit(c.MOTION_REPORT_TIMEOUT, motion_lost)
-        | c.bit(c.LONG_REPORT_TIMEOUT, long_lost)
-        | c.bit(c.POSE_TIMEOUT, pose_lost and not pose_poor)
-        | c.bit(c.OPERATOR_TIMEOUT, oper_lost)
-        | c.bit(c.POSE_INVALID, pose_lost and pose_poor)
-        | c.bit(c.POSE_JUMP, believed.disbelieved >= JUMPS_IN_A_ROW)
-        | c.bit(c.OFF_PATH, off_path)
-        | c.bit(c.OVER_SPEED, over_speed)
-        | c.bit(c.STEERING_NOT_FOLLOWING, next_state.steering_gap_us >= STEERING_GAP_US)
-        | c.bit(c.SPEED_NOT_FOLLOWING, next_state.speed_gap_us >= SPEED_GAP_US)
-        | c.bit(c.WRONG_DIRECTION, next_state.wrong_direction_us >= WRONG_DIRECTION_US)
-        | c.bit(c.CYCLE_OVERRUN, overrun)
-        | c.bit(c.COMMAND_REJECTED, next_state.rejected_us >= REJECTED_US)
-        | c.bit(c.SECOND_CONTROLLER, inputs.second_controller != 0)
-        | c.bit(c.START_PRESSED, inputs.oper.oper_start != 0 and state.start_was_pressed == 0 and not oper_lost)
-        | c.bit(c.CLEAR_PRESSED, inputs.oper.oper_clear != 0 and state.clear_was_pressed == 0 and not oper_lost)
-    )
+    present = 0
+    if sys_lost or steer_lost or motion_lost or long_lost or pose_lost or version_lost:
+        present |= 1 << c.WAITING_FOR_REPORTS
+    if oper_lost:
+        present |= 1 << c.WAITING_FOR_OPERATOR
+    if not version_lost and inputs.version.veh_dbc_hash != tables.dbc_hash24:
+        present |= 1 << c.DBC_HASH_MISMATCH
+    if not version_lost and inputs.version.veh_vehicle_hash != tables.vehicle_hash24:
+        present |= 1 << c.VEHICLE_HASH_MISMATCH
+    if away_from_start:
+        present |= 1 << c.POSE_NOT_AT_START
+    if believed.averaged < SETTLED_POSES:
+        present |= 1 << c.POSE_SETTLING
+    if not standstill:
+        present |= 1 << c.NOT_AT_STANDSTILL
+    if standstill:
+        present |= 1 << c.STANDSTILL
+    if sys.vehicle_state != MODE_READY:
+        present |= 1 << c.VEHICLE_NOT_READY
+    if not sys_lost and sys.vehicle_state == MODE_ACTIVE:
+        present |= 1 << c.VEHICLE_ACTIVE
+    if oper.oper_stop != 0:
+        present |= 1 << c.OPERATOR_STOP
+    if oper.oper_estop != 0:
+        present |= 1 << c.EMERGENCY_STOP
+    if sys.driver_override != 0 or steer.steer_override != 0 or long.brake_override != 0:
+        present |= 1 << c.DRIVER_OVERRIDE
+    if (
+        sys.vehicle_state == MODE_FAULT
+        or steer.steer_fault != 0
+        or long.long_fault != 0
+        or (active and not sys_lost and sys.vehicle_state != MODE_ACTIVE)
+    ):
+        present |= 1 << c.VEHICLE_FAULT
+    if sys_lost:
+        present |= 1 << c.SYS_REPORT_TIMEOUT
+    if steer_lost:
+        present |= 1 << c.STEER_REPORT_TIMEOUT
+    if motion_lost:
+        present |= 1 << c.MOTION_REPORT_TIMEOUT
+    if long_lost:
+        present |= 1 << c.LONG_REPORT_TIMEOUT
+    if pose_lost and not pose_poor:
+        present |= 1 << c.POSE_TIMEOUT
+    if oper_lost:
+        present |= 1 << c.OPERATOR_TIMEOUT
+    if pose_lost and pose_poor:
+        present |= 1 << c.POSE_INVALID
+    if believed.disbelieved >= JUMPS_IN_A_ROW:
+        present |= 1 << c.POSE_JUMP
+    if off_path:
+        present |= 1 << c.OFF_PATH
+    if over_speed:
+        present |= 1 << c.OVER_SPEED
+    if next_state.steering_gap_us >= STEERING_GAP_US:
+        present |= 1 << c.STEERING_NOT_FOLLOWING
+    if next_state.speed_gap_us >= SPEED_GAP_US:
+        present |= 1 << c.SPEED_NOT_FOLLOWING
+    if next_state.wrong_direction_us >= WRONG_DIRECTION_US:
+        present |= 1 << c.WRONG_DIRECTION
+    if overrun:
+        present |= 1 << c.CYCLE_OVERRUN
+    if next_state.rejected_us >= REJECTED_US:
+        present |= 1 << c.COMMAND_REJECTED
+    if inputs.second_controller != 0:
+        present |= 1 << c.SECOND_CONTROLLER
+    if oper.oper_start != 0 and state.start_was_pressed == 0 and not oper_lost:
+        present |= 1 << c.START_PRESSED
+    if oper.oper_clear != 0 and state.clear_was_pressed == 0 and not oper_lost:
+        present |= 1 << c.CLEAR_PRESSED
     return next_state, present
 
 

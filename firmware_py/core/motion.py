@@ -34,24 +34,22 @@ def advance(
     `travel_speed_mps` is positive along the leg's travel. The heading changes with the mean angle of the interval,
     which is exact for the lag (table weight) and a good approximation under the rate limit.
     """
+    station_m, cross_m, heading_rad, disturbance_1pm, angle_rad = state
     limit_rad = car.max_road_wheel_rate_radps * dt_s
-    gap_rad = angle_cmd_rad - state.road_wheel_angle_rad
+    gap_rad = angle_cmd_rad - angle_rad
     change_rad = max(min(car.lag_alpha * gap_rad, limit_rad), -limit_rad)
     mean_change_rad = max(min((1.0 - car.lag_mean_weight) * gap_rad, limit_rad), -limit_rad)
-    curvature_1pm = math.tan(state.road_wheel_angle_rad + mean_change_rad) / car.wheelbase_m
+    curvature_1pm = math.tan(angle_rad + mean_change_rad) / car.wheelbase_m
 
     ds_m = travel_speed_mps * dt_s
-    reference_1pm = feedforward_curvature_1pm(leg, state.station_m + 0.5 * ds_m)
-    scale = 1.0 - reference_1pm * state.cross_track_error_m
-    path_ds_m = ds_m * math.cos(state.heading_error_rad) / max(scale, 0.5)
-    heading_change_rad = leg.sigma * (
-        (curvature_1pm + state.curvature_disturbance_1pm) * ds_m - reference_1pm * path_ds_m
-    )
-    mean_heading_error_rad = state.heading_error_rad + 0.5 * heading_change_rad
+    reference_1pm = feedforward_curvature_1pm(leg, station_m + 0.5 * ds_m)
+    path_ds_m = ds_m * math.cos(heading_rad) / max(1.0 - reference_1pm * cross_m, 0.5)
+    heading_change_rad = leg.sigma * ((curvature_1pm + disturbance_1pm) * ds_m - reference_1pm * path_ds_m)
+    mean_heading_rad = heading_rad + 0.5 * heading_change_rad
     return PathState(
-        station_m=state.station_m + path_ds_m,
-        cross_track_error_m=state.cross_track_error_m + leg.sigma * math.sin(mean_heading_error_rad) * ds_m,
-        heading_error_rad=state.heading_error_rad + heading_change_rad,
-        curvature_disturbance_1pm=state.curvature_disturbance_1pm,
-        road_wheel_angle_rad=state.road_wheel_angle_rad + change_rad,
+        station_m=station_m + path_ds_m,
+        cross_track_error_m=cross_m + leg.sigma * math.sin(mean_heading_rad) * ds_m,
+        heading_error_rad=heading_rad + heading_change_rad,
+        curvature_disturbance_1pm=disturbance_1pm,
+        road_wheel_angle_rad=angle_rad + change_rad,
     )

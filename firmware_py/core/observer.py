@@ -7,7 +7,7 @@ A discrete steady-state observer on the nominal motion model; its coefficients c
 from typing import NamedTuple
 
 from firmware_py.core.motion import PathState, advance
-from firmware_py.core.path import PoseError, locate, pose_error
+from firmware_py.core.path import PoseError, pose_at, pose_error
 from firmware_py.core.schedule import Gains
 from firmware_py.core.tables import CarTable, LegTable
 
@@ -82,7 +82,7 @@ def predict_to_pose(
 def innovation(leg: LegTable, observer: ObserverState, x_m: float, y_m: float, yaw_rad: float) -> PoseError:
     """Return how far a measured pose is from the observed one."""
     path = observer.path
-    measured = pose_error(locate(leg, path.station_m), leg.sigma, x_m, y_m, yaw_rad)
+    measured = pose_error(pose_at(leg, path.station_m), leg.sigma, x_m, y_m, yaw_rad)
     return PoseError(
         along_m=measured.along_m,
         cross_track_error_m=measured.cross_track_error_m - path.cross_track_error_m,

@@ -13,7 +13,6 @@ from firmware_py.core.tables import (
     L_PE,
     L_PP,
     PREVIEW,
-    Column,
     GainTable,
 )
 
@@ -37,29 +36,33 @@ class Gains(NamedTuple):
     l_dp: float
 
 
-def _between(low: Column, high: Column, b: float, column: int) -> float:
-    return (1.0 - b) * low[column] + b * high[column]
-
-
 def gains_at(table: GainTable, direction: int, travel_speed_mps: float) -> Gains:
     """Return the gains for a direction index and a travel speed (never negative); held beyond the grid's ends."""
+    grid = table.speed_grid_mps
+    # The first row whose upper end is not below the speed, by halving.
     row = 0
-    while row < table.last_row - 1 and table.speed_grid_mps[row + 1] < travel_speed_mps:
-        row += 1
-    low_mps = table.speed_grid_mps[row]
-    b = (travel_speed_mps - low_mps) / (table.speed_grid_mps[row + 1] - low_mps)
+    highest = table.last_row - 1
+    while row < highest:
+        middle = (row + highest) // 2
+        if grid[middle + 1] < travel_speed_mps:
+            row = middle + 1
+        else:
+            highest = middle
+    low_mps = grid[row]
+    b = (travel_speed_mps - low_mps) / (grid[row + 1] - low_mps)
     b = max(min(b, 1.0), 0.0)
+    a = 1.0 - b
     low = table.gain[direction][row]
     high = table.gain[direction][row + 1]
     return Gains(
-        preview_m=_between(low, high, b, PREVIEW),
-        kp=_between(low, high, b, KP),
-        ki=_between(low, high, b, KI),
-        kd=_between(low, high, b, KD),
-        l_ee=_between(low, high, b, L_EE),
-        l_ep=_between(low, high, b, L_EP),
-        l_pe=_between(low, high, b, L_PE),
-        l_pp=_between(low, high, b, L_PP),
-        l_de=_between(low, high, b, L_DE),
-        l_dp=_between(low, high, b, L_DP),
+        preview_m=a * low[PREVIEW] + b * high[PREVIEW],
+        kp=a * low[KP] + b * high[KP],
+        ki=a * low[KI] + b * high[KI],
+        kd=a * low[KD] + b * high[KD],
+        l_ee=a * low[L_EE] + b * high[L_EE],
+        l_ep=a * low[L_EP] + b * high[L_EP],
+        l_pe=a * low[L_PE] + b * high[L_PE],
+        l_pp=a * low[L_PP] + b * high[L_PP],
+        l_de=a * low[L_DE] + b * high[L_DE],
+        l_dp=a * low[L_DP] + b * high[L_DP],
     )

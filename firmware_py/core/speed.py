@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from firmware_py.core.path import locate
+from firmware_py.core.path import plan_at
 from firmware_py.core.tables import CarTable, LegTable
 
 STATION_GAIN_1PS = 0.8
@@ -70,13 +70,11 @@ def follow(
             SpeedState(reference_station_m=leg.length_m, accel_mps2=0.0, stopping=1),
             SpeedCommand(travel_speed_mps=0.0, brake_decel_mps2=STOP_DECEL_MPS2),
         )
-    reference = locate(leg, state.reference_station_m)
-    station_m = min(state.reference_station_m + reference.speed_mps * dt_s, leg.length_m)
+    planned_mps, planned_mps2 = plan_at(leg, state.reference_station_m)
+    station_m = min(state.reference_station_m + planned_mps * dt_s, leg.length_m)
     station_m = min(station_m, station_now_m + REFERENCE_LEAD_M)
     wanted_mps = (
-        reference.speed_mps
-        + car.drive_lag_s * reference.accel_mps2
-        + STATION_GAIN_1PS * (state.reference_station_m - station_now_m)
+        planned_mps + car.drive_lag_s * planned_mps2 + STATION_GAIN_1PS * (state.reference_station_m - station_now_m)
     )
     lag_s = max(car.drive_lag_s, LEAST_DRIVE_LAG_S)
     eased_mps2 = JERK_LIMIT_MPS3 * dt_s

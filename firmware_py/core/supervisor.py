@@ -91,6 +91,20 @@ _FIRST_ROW = tuple(min(i for i, row in enumerate(TRANSITIONS) if row[0] == mode)
 _END_ROW = tuple(max(i for i, row in enumerate(TRANSITIONS) if row[0] == mode) + 1 for mode in range(4))
 
 
+def _any_required(mode: int) -> int:
+    """Return the conditions of which one must be present for any row of the mode to hold; -1 where a row needs none."""
+    mask = 0
+    for row in TRANSITIONS:
+        if row[0] == mode:
+            if row[1] == 0:
+                return -1
+            mask |= row[1]
+    return mask
+
+
+_ANY_REQUIRED = tuple(_any_required(mode) for mode in range(4))
+
+
 class SupervisorState(NamedTuple):
     """The mode, why, what a fault asks for, and how long the present request to the vehicle has lasted."""
 
@@ -111,6 +125,8 @@ def begin() -> SupervisorState:
 
 def find_transition(mode: int, conditions: int) -> int:
     """Return the row of TRANSITIONS that decides for a mode, or -1 where the mode stays."""
+    if _ANY_REQUIRED[mode] != -1 and (conditions & _ANY_REQUIRED[mode]) == 0:
+        return -1  # nothing has happened: by far the most cycles, without a look at each row
     for row in range(_FIRST_ROW[mode], _END_ROW[mode]):
         if (conditions & TRANSITIONS[row][1]) == TRANSITIONS[row][1] and (conditions & TRANSITIONS[row][2]) == 0:
             return row
