@@ -155,7 +155,7 @@ def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Sess
     disturbed, folder = session.figures["disturbed"], session.folder
     final = disturbed["final"]
     assert disturbed["controller_status"] == 3, "ended in good order, stopped before the end"
-    assert final["send_failed"] > 100
+    assert final["send_failed"] > 30
     assert re.search(
         r"^parkctl: stopped: .+ missing .*for its timeout",
         (folder / "disturbed_controller/controller.txt").read_text(),
@@ -168,7 +168,7 @@ def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Sess
     after = [
         command.decode(data) for _, number, data, _ in load_log(folder / "after.log") if number == command.frame_id
     ]
-    assert len(after) > 20
+    assert len(after) > 10
     assert {str(values["control_mode"]) for values in after} == {"Fault"}
     truth = (folder / "disturbed/truth.csv").read_text().splitlines()
     column = truth[0].split(",").index("speed_mps")
@@ -252,6 +252,12 @@ def screen_of(stream: str, rows: int, columns: int) -> list[str]:
         elif action == "b":
             screen[row][column : column + first] = [last] * first
             column += first
+        elif action == "P":
+            screen[row][column : column + first] = []
+            screen[row] += [" "] * first
+        elif action == "L":
+            screen[row:row] = [[" "] * columns for _ in range(first)]
+            del screen[rows:]
         elif action == "K":
             screen[row][column:] = [" "] * (columns - column)
         elif action == "J":

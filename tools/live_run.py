@@ -230,6 +230,7 @@ class LiveRun:
             limit_s = STANDSTILL_LIMIT_S if driving else END_LIMIT_S
             if not self._pump_until(child.ended, limit_s):
                 child.kill()
+            self._pump()  # its last frames
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[None]:
