@@ -32,9 +32,9 @@ DATABASE = cantools.database.load_file(DBC)
 FED_NODES = {"VEH", "LOC", "OPER"}
 SAME_TIME_S = 0.015
 """A replayed command may come so much earlier or later than the recorded one: its cycle, or the next or last one."""
-SAME_STEER_RAD, SAME_SPEED_MPS = 0.004, 0.004
-"""99 % of the replayed commands are as near as that to a recorded one of the same time, and half within a quarter."""
-WORST = 5.0
+SAME_STEER_RAD, SAME_SPEED_MPS = 0.006, 0.004
+"""99 % of the replayed commands are as near as that to a recorded one of the same time, and half within a half."""
+WORST = 4.0
 """None is further off than so many times that: two cycles' worth of the fastest steering command."""
 
 Log = list[tuple[float, int, bytes, bool]]
@@ -218,7 +218,7 @@ def test_canplayer_makes_the_controller_give_its_commands_again(
         near = recorded[bisect.bisect(times, time_s - SAME_TIME_S) : bisect.bisect(times, time_s + SAME_TIME_S)]
         off.append(min(abs(value - other) for _, other in near))
     off.sort()
-    assert off[len(off) // 2] <= 0.25 * tolerance
+    assert off[len(off) // 2] <= 0.5 * tolerance
     assert off[int(0.99 * len(off))] <= tolerance
     assert off[-1] <= WORST * tolerance
 
