@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ def test_a_passed_test_and_what_it_leaves(here: Path, capsys: pytest.CaptureFixt
             assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 100, "the picture is not empty"
     ids = {message.arbitration_id for message in can.LogReader(Path("run") / "bus.log")}
     assert {0x10, 0x20, 0x30, 0x200, 0x600} <= ids
-    assert not (Path("run") / "tables").exists(), "the shipped tables are not copied"
+    assert {file.name for file in (Path("run") / "tables").iterdir()} == {f.name for f in _shipped("paper").iterdir()}
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
@@ -117,3 +118,26 @@ def _shipped(vehicle: str) -> Path:
     import firmware_py  # noqa: PLC0415
 
     return Path(firmware_py.__file__).parent / "tables" / f"{vehicle}-ohio"
+
+
+def test_a_run_keeps_the_tables_that_it_began_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables that are made anew while a car drives by the old ones must not be mixed into its figures."""
+    shutil.copytree(_shipped("paper"), "mine")
+    plain_run = lockstep.run_lockstep
+
+    def remade_meanwhile(*arguments: Any, **options: Any) -> lockstep.LockstepRun:
+        shutil.rmtree("mine")
+        return plain_run(*arguments, **options)
+
+    monkeypatch.setattr(lockstep, "run_lockstep", remade_meanwhile)
+    assert demo("--tables", "mine", "--no-plots")["passed"] is True
+
+
+def test_an_interrupt_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt(*_arguments: Any, **_options: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(lockstep, "run_lockstep", interrupt)
+    assert cli.main(["demo", "--lockstep"]) == 130
+    assert capsys.readouterr().err == "parkctl: interrupted\n"
+    assert not list(Path().rglob("run.json"))

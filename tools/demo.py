@@ -32,8 +32,6 @@ LISTEN_S = 0.25
 """A bus is listened to for so long before it is used: twice the longest timeout of a fast message."""
 DBC = Path(__file__).resolve().parent.parent / "dbc" / "parking.dbc"
 LAWS = ("car", "pid+ff")
-TEMPORARY = "parkctl-tables-"
-"""How the names of temporary folders with tables begin."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -123,8 +121,13 @@ def run(args: argparse.Namespace) -> int:
     print(f"scenario  {plan.scenario.name}: {plan.scenario.description}; law {plan.law}, seed {plan.seed}")
     with ExitStack() as stack:
         bus = None if plan.lockstep else _quiet_bus(plan.bus, stack)
-        tables = _given_tables(plan, Path(args.tables)) if args.tables else _tables(plan, stack)
-        driven = _drive_lockstep(plan, tables, folder) if bus is None else _drive_live(plan, tables, folder, bus)
+        made = _given_tables(plan, Path(args.tables)) if args.tables else _tables(plan, stack)
+        tables = _begin_folder(plan, made, folder)
+        try:
+            driven = _drive_lockstep(plan, tables, folder) if bus is None else _drive_live(plan, tables, folder, bus)
+        except (UserError, KeyboardInterrupt):
+            folder.discard()
+            raise
         return _report(plan, tables, folder, driven, console, json_file, plots=not args.no_plots)
 
 
@@ -188,7 +191,7 @@ def _tables(plan: Plan, stack: ExitStack) -> Path:
     if shipped is not None:
         return shipped
     print(f"tables    no fresh ones are shipped for {plan.vehicle.name} on {plan.course.name}: made now", flush=True)
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / "tables"
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="parkctl-tables-"))) / "tables"
     design_tables(plan.vehicle, plan.course, folder)
     return folder
 
@@ -200,7 +203,6 @@ def _drive_lockstep(plan: Plan, tables: Path, folder: RunFolder) -> Driven:
     from tools.lockstep import run_lockstep  # noqa: PLC0415
 
     result = run_lockstep(plan.vehicle, plan.course, plan.scenario, plan.side, plan.seed, plan.law, tables, record=True)
-    _begin_folder(plan, tables, folder)
     with BusLog(folder.path / "bus.log", "lockstep") as log:
         log.add([(*frame, False) for frame in result.frames])
     write_whole(folder.path / "truth.csv", _csv_of(result.truth))
@@ -227,18 +229,11 @@ def _drive_live(plan: Plan, tables: Path, folder: RunFolder, bus: can.BusABC) ->
     for name, value in plan.named.items():
         emulator += [f"--{name}", value]
     path = load_path(tables, plan.side)
-    _begin_folder(plan, tables, folder)
     watch = f"python -m can.viewer {' '.join(bus_options)}"
     print(f"bus       {plan.bus} (watch it in another terminal: {watch})")
-    try:
-        with BusLog(folder.path / "bus.log", _log_channel(plan.bus)) as log:
-            live = LiveRun(
-                bus=bus, station=Station(DBC), log=log, progress=Progress(), path=path, realtime=plan.realtime
-            )
-            outcome = live.run(controller, emulator, folder.path)
-    except UserError:
-        folder.discard()
-        raise
+    with BusLog(folder.path / "bus.log", _log_channel(plan.bus)) as log:
+        live = LiveRun(bus=bus, station=Station(DBC), log=log, progress=Progress(), path=path, realtime=plan.realtime)
+        outcome = live.run(controller, emulator, folder.path)
     truth, exam = folder.path / "truth.csv", folder.path / "exam.json"
     return Driven(
         load_truth(truth) if truth.is_file() else None,
@@ -260,8 +255,11 @@ def _csv_of(rows: list[Any]) -> str:
     return "\n".join([",".join(rows[0]._fields), *(",".join(repr(value) for value in row) for row in rows)]) + "\n"
 
 
-def _begin_folder(plan: Plan, tables: Path, folder: RunFolder) -> None:
-    """Make the run's folder with what the run is, and with its tables where they were designed for it."""
+def _begin_folder(plan: Plan, tables: Path, folder: RunFolder) -> Path:
+    """Make the run's folder with what the run is and its own copy of the tables; return the copy's folder.
+
+    Controller and figures use the copy: the run can be understood later, whatever becomes of the tables.
+    """
     folder.make()
     about = {
         **_setup(plan),
@@ -273,8 +271,9 @@ def _begin_folder(plan: Plan, tables: Path, folder: RunFolder) -> None:
         "command": sys.argv,
     }
     write_whole(folder.path / MARK, json.dumps(about, indent=2) + "\n")
-    if tables.parent.name.startswith(TEMPORARY):
-        shutil.copytree(tables, folder.path / "tables")
+    copy = folder.path / "tables"
+    shutil.copytree(tables, copy)
+    return copy
 
 
 def _setup(plan: Plan) -> dict[str, Any]:
