@@ -5,7 +5,6 @@ The unknown is b = v^2 on the path's grid, in which acceleration b'/2 is linear.
 lies below it, every solution of the linear programme keeps the true limit, and repeating it only makes the ride faster.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -115,8 +114,3 @@ def profile_jerk(profile: SpeedProfile) -> Floats:
     step = float(profile.station_m[1] - profile.station_m[0])
     accel = np.diff(profile.speed_mps**2) / (2.0 * step)
     return np.asarray(np.diff(accel) / step * profile.speed_mps[1:-1])
-
-
-def total_time(profiles: list[SpeedProfile]) -> float:
-    """Riding time of all legs, s."""
-    return math.fsum(profile.duration_s for profile in profiles)

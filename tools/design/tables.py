@@ -18,8 +18,8 @@ from sim.data_files import Course, Vehicle, load_course, load_vehicle
 from sim.errors import UserError
 from tools.design.gains import COLUMNS as GAINS_COLUMNS
 from tools.design.gains import design_gains
-from tools.design.optimise import PathDesign, optimise_path
-from tools.design.speed_profile import GRAVITY_MPS2, SpeedLimits, SpeedProfile, plan_speed
+from tools.design.optimise import PathDesign, max_road_wheel_slope, optimise_path
+from tools.design.speed_profile import GRAVITY_MPS2, SpeedLimits, SpeedProfile, plan_speed, road_wheel_slope
 
 FORMAT = 1
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -318,6 +318,11 @@ def as_json(report: DesignReport, certificate: Any) -> dict[str, Any]:
             "max_curvature_1pm": float(abs(path.curvature_1pm).max()),
             "max_curvature_slope_1pm2": float(abs(path.curvature_slope_1pm2).max()),
             "max_road_wheel_angle_rad": report.design.max_road_wheel_angle_rad,
+            "max_road_wheel_slope_radpm": max_road_wheel_slope(report.design, report.vehicle.wheelbase_m),
+            "max_road_wheel_rate_radps": max(
+                float(abs(profile.speed_mps * road_wheel_slope(path, report.vehicle.wheelbase_m)[::sign]).max())
+                for profile, sign in zip(report.profiles, (1, -1), strict=True)
+            ),
             "min_clearance_m": report.design.clearance_m,
             "nearest_cone": report.design.nearest_cone,
             "length_m": path.length_m,
