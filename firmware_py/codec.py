@@ -47,6 +47,15 @@ STRUCTS: dict[str, type[Any]] = {
 }
 """The struct of each message; its fields are the payload signals, in the DBC's order."""
 
+PAIR = ("LOC_Position", "LOC_Attitude")
+"""Two messages of one sample: their values belong together where their counters are equal."""
+
+VALID_BITS = {
+    "VEH_MotionRpt": (("speed_valid", "speed_meas_mps"), ("yaw_rate_valid", "yaw_rate_meas_radps")),
+    "VEH_SteerRpt": (("steer_angle_valid", "road_wheel_angle_meas_rad"),),
+}
+"""Signals that say whether another signal of the message may be used; one that may not keeps its last value."""
+
 INPUT_MESSAGES = (
     "VEH_SysRpt",
     "VEH_SteerRpt",
@@ -285,7 +294,7 @@ def _unpack_expression(signal: "Signal") -> str:
 class _Slot:
     """The newest valid values of one message."""
 
-    __slots__ = ("frame_id", "receiver", "unpack", "used", "values")
+    __slots__ = ("frame_id", "partner", "receiver", "unpack", "used", "valid_bits", "values", "waiting")
 
     def __init__(self, info: MessageInfo, unpack: Unpack) -> None:
         self.frame_id = info.frame_id
@@ -293,18 +302,40 @@ class _Slot:
         self.unpack = unpack
         self.values: Any = unpack(bytes(FRAME_BYTES))
         self.used = NO_COUNTER
+        fields = info.struct._fields
+        self.valid_bits = tuple((fields.index(b), fields.index(v)) for b, v in VALID_BITS.get(info.name, ()))
+        self.partner: _Slot | None = None
+        self.waiting: tuple[int, Any] | None = None  # counter and values that wait for the partner's frame
+
+    def keep(self, counter: int, values: Any) -> None:
+        """Take over the values of a valid frame; a value that says itself that it is invalid is not taken."""
+        for bit, value in self.valid_bits:
+            if not values[bit]:
+                values = values._replace(**{values._fields[value]: self.values[value]})
+        if self.partner is None:
+            self.values, self.used = values, counter
+            return
+        self.waiting = (counter, values)
+        if self.partner.waiting is not None and self.partner.waiting[0] == counter:
+            for slot in (self, self.partner):
+                slot.used, slot.values = slot.waiting or (NO_COUNTER, slot.values)
+                slot.waiting = None
 
 
 class Mailbox:
     """Receiving side of the controller: keeps the newest valid values of each message until the cycle takes them.
 
     A rejected frame changes no value and no baseline; it is counted by its reason. `second_controller` is 1 from a
-    frame that only a controller may send until the next `take`.
+    frame that only a controller may send until the next `take`. The two messages of a pose are handed out together or
+    not at all, whichever cycles their frames fall into.
     """
 
     def __init__(self, codec: Codec) -> None:
         self._slots = tuple(_Slot(codec.messages[name], codec.unpack[name]) for name in INPUT_MESSAGES)
         self._slot_by_id = {slot.frame_id: slot for slot in self._slots}
+        slot_of = dict(zip(INPUT_MESSAGES, self._slots, strict=True))
+        for one, other in (PAIR, PAIR[::-1]):
+            slot_of[one].partner = slot_of[other]
         self._own_ids = frozenset(info.frame_id for info in codec.messages.values() if info.sender == NODE)
         self.received = 0
         self.foreign = 0
@@ -333,8 +364,7 @@ class Mailbox:
         elif slot.receiver.check(now_ns, data[1] & 0x0F) != e2e.OK:
             self.rejected_counter += 1
         else:
-            slot.values = slot.unpack(data)
-            slot.used = data[1] & 0x0F
+            slot.keep(data[1] & 0x0F, slot.unpack(data))
             self.received += 1
 
     def take(self, now_us: int, overruns: int) -> Inputs:
@@ -351,16 +381,27 @@ class Mailbox:
         return inputs
 
 
+class _Outgoing:
+    """One sent message with its rolling counter."""
+
+    __slots__ = ("counter", "frame_id", "pack")
+
+    def __init__(self, frame_id: int, pack: Pack) -> None:
+        self.frame_id = frame_id
+        self.pack = pack
+        self.counter = 0
+
+
 class Sender:
     """Sending side of the controller: one rolling counter a message; `nan_count` counts values that were no number."""
 
     def __init__(self, codec: Codec) -> None:
-        self._codec = codec
-        self._counters = dict.fromkeys(STRUCTS, 0)
+        self._outgoing = {name: _Outgoing(codec.messages[name].frame_id, codec.pack[name]) for name in STRUCTS}
         self.nan_count = 0
 
     def pack(self, name: str, values: tuple[Any, ...]) -> tuple[int, bytes]:
         """Return (arbitration id, payload) of the next frame of the message `name`."""
-        counter = self._counters[name]
-        self._counters[name] = (counter + 1) % e2e.COUNTER_VALUES
-        return self._codec.messages[name].frame_id, self._codec.pack[name](values, counter, self)
+        outgoing = self._outgoing[name]
+        counter = outgoing.counter
+        outgoing.counter = (counter + 1) % e2e.COUNTER_VALUES
+        return outgoing.frame_id, outgoing.pack(values, counter, self)

@@ -73,6 +73,7 @@ class Loop:
         self._step = Histogram()
         self._longest_stall = 0
         self._signalled = False
+        self._stopping_cycles = 0
         self._reason = c.WAITING_FOR_REPORTS
         self._completed = False
 
@@ -152,7 +153,8 @@ class Loop:
         over = (self._once and (self._completed or seen.mode == MODE_FAULT)) or self._signalled
         if not over:
             return 0
-        if node.is_driving and not self._bus.is_listening_only and ending < STOPPING_CYCLES:
+        self._stopping_cycles += 1
+        if node.is_driving and not self._bus.is_listening_only and self._stopping_cycles < STOPPING_CYCLES:
             # Stopping: the end begins when the car stands.
             return 0
         return ending + 1
@@ -233,8 +235,13 @@ def clock_resolution_ns() -> int:
 
 
 def status_writer(enabled: bool) -> int | None:
-    """Return standard output as a descriptor that never blocks, or None."""
+    """Return standard output as a descriptor that never blocks, or None.
+
+    A terminal is opened anew, so that whoever shares it does not find it changed.
+    """
     if not enabled:
         return None
+    if os.isatty(1):
+        return os.open(os.ttyname(1), os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY)
     os.set_blocking(1, False)
     return 1

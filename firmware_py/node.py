@@ -5,6 +5,7 @@ from typing import NamedTuple
 from firmware_py.codec import Codec, Mailbox, Sender
 from firmware_py.core import conditions as c
 from firmware_py.core import controller
+from firmware_py.core.health import PROTOCOL
 from firmware_py.core.signals import (
     MODE_ACTIVE,
     MODE_FAULT,
@@ -17,7 +18,7 @@ from firmware_py.core.signals import (
     SysCommand,
     Track,
 )
-from firmware_py.core.supervisor import STOP_EMERGENCY, SupervisorState
+from firmware_py.core.supervisor import STOP_EMERGENCY, STOP_RELEASE, SupervisorState
 from firmware_py.core.tables import Tables, Timeouts
 from firmware_py.health_frames import HealthFrames
 from firmware_py.record import FlightRecord
@@ -25,7 +26,9 @@ from firmware_py.table_file import TableSet
 
 Frame = tuple[int, bytes]
 
-PROTOCOL = 1
+FAILED_CYCLES = 300
+"""So many failed cycles in a row the vehicle is kept enabled to brake and steer straight on; then it is released."""
+
 CYCLE_INDEX_VALUES = 1 << 20
 WAKE_TIME_VALUES = 1 << 32
 
@@ -79,6 +82,7 @@ class ControllerNode:
         self.overruns = 0
         self.frames_sent = 0
         self.internal_errors: list[str] = []
+        self._failed_cycles = 0
         self._sender = Sender(codec)
         self._tables = tables
         self._state = controller.begin()
@@ -142,7 +146,7 @@ class ControllerNode:
     def is_driving(self) -> bool:
         """Whether the controller is responsible for a car that may move."""
         mode = self._state.supervisor.mode
-        return mode == MODE_ACTIVE or (mode == MODE_FAULT and self._state.standstill == 0)
+        return mode == MODE_ACTIVE or (mode == MODE_FAULT and self._state.supervisor.released == 0)
 
     def _step(self, inputs: Inputs) -> Outputs:
         """Run the core; whatever it may raise becomes a fault with an emergency stop, never an exception."""
@@ -150,18 +154,22 @@ class ControllerNode:
             self._state, outputs = controller.step(self._tables, self._state, inputs)
         except Exception as error:
             return self._fail(error, inputs)
+        self._failed_cycles = 0
         return outputs
 
     def _fail(self, error: Exception, inputs: Inputs) -> Outputs:
         if len(self.internal_errors) < 10:
             self.internal_errors.append(f"{type(error).__name__}: {error}")
-        was_driving = self.is_driving
+        self._failed_cycles += 1
+        was = self._state.supervisor
+        followed = self._outputs is not None and self._outputs.steer.steer_enable != 0
+        follow = 1 if followed and was.reaction != STOP_RELEASE and self._failed_cycles <= FAILED_CYCLES else 0
         angle_rad = self._state.sent_angles_rad[0]
+        reaction = STOP_RELEASE if was.reaction == STOP_RELEASE else STOP_EMERGENCY
         self._state = self._state._replace(
             last_us=inputs.now_us,
-            supervisor=SupervisorState(MODE_FAULT, c.INTERNAL_ERROR, STOP_EMERGENCY, 0, 0, 0),
+            supervisor=SupervisorState(MODE_FAULT, c.INTERNAL_ERROR, reaction, 0, 0, 0, 1 - follow, was.fault_us),
         )
-        follow = 1 if was_driving else 0
         leg = self._state.manoeuvre.leg
         return Outputs(
             sys=SysCommand(follow, 0, MODE_FAULT, leg, c.INTERNAL_ERROR),

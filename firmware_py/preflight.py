@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 from firmware_py.bus import Bus, Heard, frame_bits
 from firmware_py.codec import FRAME_BYTES, INPUT_MESSAGES, NODE, Codec, Mailbox, MessageInfo
+from firmware_py.core.health import PROTOCOL
 from firmware_py.core.signals import MODE_ACTIVE, Inputs
 from firmware_py.errors import UserError
 from firmware_py.loop import clock_resolution_ns, listen
-from firmware_py.node import PROTOCOL
 from firmware_py.realtime import Outcome
 from firmware_py.table_file import TableSet
 

@@ -6,6 +6,7 @@ as far as Active. Nothing of it reaches the bus, and no state of it is kept.
 
 from firmware_py.codec import Codec, Sender
 from firmware_py.core.controller import PERIOD_US
+from firmware_py.core.health import PROTOCOL
 from firmware_py.core.signals import (
     GEAR_PARK,
     MODE_ACTIVE,
@@ -22,7 +23,7 @@ from firmware_py.core.signals import (
 )
 from firmware_py.core.tables import Tables
 from firmware_py.errors import UserError
-from firmware_py.node import PROTOCOL, ControllerNode
+from firmware_py.node import ControllerNode
 from firmware_py.reasons import TEXT
 
 CYCLES = 200

@@ -9,7 +9,7 @@ from core_support import shipped_tables
 from firmware_py.core import gate, limits
 from firmware_py.core import signals as s
 from firmware_py.core.speed import HOLD_DECEL_MPS2
-from firmware_py.core.supervisor import STOP_CONTROLLED, STOP_EMERGENCY, STOP_NONE, STOP_RELEASE
+from firmware_py.core.supervisor import STOP_CONTROLLED, STOP_EMERGENCY, STOP_NONE
 
 PERIOD_S = 0.01
 LSB_RAD = 4e-5
@@ -19,14 +19,14 @@ TOP_RAD = CAR.max_road_wheel_angle_rad
 
 
 def passed(angle_rad, speed_mps=0.5, brake_mps2=0.0, *, previous_rad=0.0, carry_rad=0.0, sigma=1.0, **how):
-    how = {"mode": s.MODE_ACTIVE, "reaction": STOP_NONE, "standstill": False, **how}
+    how = {"mode": s.MODE_ACTIVE, "reaction": STOP_NONE, "released": 0, **how}
     wanted = gate.Wanted(angle_rad, speed_mps, brake_mps2)
     return gate.gate(
         CAR,
         LSB_RAD,
         how["mode"],
         how["reaction"],
-        how["standstill"],
+        how["released"],
         sigma,
         wanted,
         previous_rad,
@@ -89,21 +89,13 @@ def test_nothing_is_followed_before_active(mode):
     assert (result.follow, result.speed_mps, result.brake_decel_mps2) == (0, 0.0, HOLD_DECEL_MPS2)
 
 
-def test_a_fault_brakes_by_its_reaction_and_steers_on_until_standstill():
-    expected = {
-        STOP_CONTROLLED: (1, CAR.controlled_decel_mps2),
-        STOP_EMERGENCY: (1, CAR.emergency_decel_mps2),
-        STOP_RELEASE: (0, CAR.controlled_decel_mps2),
-    }
-    for reaction, standstill in itertools.product(expected, (False, True)):
-        result = passed(0.005, 0.5, 0.0, mode=s.MODE_FAULT, reaction=reaction, standstill=standstill)
-        follow, decel_mps2 = expected[reaction]
-        assert result.follow == (0 if standstill else follow)
-        assert (result.speed_mps, result.brake_decel_mps2) == (0.0, decel_mps2)
-        if standstill:
-            assert result.angle_rad == 0.0
-        else:
-            assert result.angle_rad == pytest.approx(0.005, abs=LSB_RAD)
+def test_a_fault_brakes_by_its_reaction_and_steers_on_until_it_is_released():
+    expected = {STOP_CONTROLLED: CAR.controlled_decel_mps2, STOP_EMERGENCY: CAR.emergency_decel_mps2}
+    for reaction, released in itertools.product(expected, (0, 1)):
+        result = passed(0.005, 0.5, 0.0, mode=s.MODE_FAULT, reaction=reaction, released=released)
+        assert result.follow == 1 - released
+        assert (result.speed_mps, result.brake_decel_mps2) == (0.0, expected[reaction])
+        assert result.angle_rad == pytest.approx(0.0 if released else 0.005, abs=LSB_RAD)
 
 
 def test_the_rounding_remainder_is_carried_so_that_the_mean_is_exact():

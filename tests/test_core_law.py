@@ -8,7 +8,7 @@ from core_support import shipped_tables, standing_inputs
 
 from firmware_py.core import controller, motion, observer, pid, predictor
 from firmware_py.core import signals as s
-from firmware_py.core.path import feedforward_curvature_1pm, locate, pose_error, wrap_angle
+from firmware_py.core.path import feedforward_at, feedforward_curvature_1pm, locate, pose_error, wrap_angle
 from firmware_py.core.schedule import gains_at
 from firmware_py.core.tables import GAIN_COLUMNS, KP
 
@@ -83,7 +83,9 @@ def test_feedback_brings_the_car_back_to_the_path_in_both_directions(direction):
             gains = gains_at(tables.gains, direction, 0.8)
             ahead = predictor.predict(leg, car, state, queue, 0.8, 0.01)
             feedback = pid.feedback_1pm(ahead.cross_track_error_m, ahead.heading_error_rad, 0.0, gains, leg.sigma)
-            angle = math.atan(car.wheelbase_m * (feedforward_curvature_1pm(leg, ahead.station_m) - feedback))
+            curvature, slope = feedforward_at(leg, ahead.station_m)
+            leads = car.steering_lag_s * 0.8 * car.wheelbase_m * slope / (1.0 + (car.wheelbase_m * curvature) ** 2)
+            angle = math.atan(car.wheelbase_m * (curvature - feedback)) + leads
             latency = car.pose_latency_samples + car.command_latency_samples
             state = motion.advance(leg, car, state, ([angle, *queue])[latency], 0.8, 0.01)
             queue = (angle, *queue[:-1])

@@ -16,7 +16,7 @@ from cantools.database.can import Message, Signal
 
 from firmware_py import codec as codec_module
 from firmware_py import e2e
-from firmware_py.codec import INPUT_MESSAGES, STRUCTS, Codec, Mailbox, Sender, load_codec
+from firmware_py.codec import INPUT_MESSAGES, PAIR, STRUCTS, VALID_BITS, Codec, Mailbox, Sender, load_codec
 from firmware_py.core.signals import NO_COUNTER, Inputs, LongCommand, SteerCommand, UsedCounters
 from firmware_py.errors import UserError
 from firmware_py.reasons import TEXT as REASON_TEXTS
@@ -115,12 +115,50 @@ def test_plant_to_controller_frame_by_frame(name: str) -> None:
     rng = random.Random(name)
     for cycle in range(40):
         values = {s.name: rng.randint(*raw_limits(s)) * s.scale for s in payload(name)}
+        values |= {bit: 1 for bit, _ in VALID_BITS.get(name, ())}
         mailbox.put(cycle * 10_000_000, *side.encode(name, values))
+        if name in PAIR:
+            mailbox.put(cycle * 10_000_000, *side.encode(PAIR[name == PAIR[0]], zeros(PAIR[name == PAIR[0]])))
         inputs = mailbox.take(cycle * 10_000, 0)
         index = INPUT_MESSAGES.index(name)
         assert inputs.used[index] == cycle % 15
         assert inputs[2 + index] == STRUCTS[name](**values)
-    assert (mailbox.received, mailbox.rejected_crc, mailbox.rejected_counter, mailbox.lost) == (40, 0, 0, 0)
+    assert mailbox.received == (80 if name in PAIR else 40)
+    assert (mailbox.rejected_crc, mailbox.rejected_counter, mailbox.lost) == (0, 0, 0)
+
+
+def zeros(name: str) -> dict[str, float]:
+    return {signal.name: 0 for signal in payload(name)}
+
+
+@pytest.mark.parametrize(
+    ("name", "bit", "value"), [(name, bit, value) for name, bits in VALID_BITS.items() for bit, value in bits]
+)
+def test_a_value_that_is_not_valid_keeps_its_last(name: str, bit: str, value: str) -> None:
+    side, mailbox = CanSide(DBC, nodes=("VEH",)), Mailbox(CODEC)
+    index = 2 + INPUT_MESSAGES.index(name)
+    for cycle, (valid, sent, read) in enumerate([(1, 0.4, 0.4), (0, 0.1, 0.4), (1, 0.2, 0.2)]):
+        mailbox.put(cycle * 10_000_000, *side.encode(name, zeros(name) | {bit: valid, value: sent}))
+        inputs = mailbox.take(cycle * 10_000, 0)
+        assert getattr(inputs[index], value) == pytest.approx(read)
+        assert getattr(inputs[index], bit) == valid
+
+
+def test_the_two_frames_of_a_pose_are_handed_out_together_whichever_cycles_they_fall_into() -> None:
+    side, mailbox = CanSide(DBC, nodes=("LOC",)), Mailbox(CODEC)
+    first, second = PAIR
+    late = side.encode(second, zeros(second))
+    mailbox.put(0, *side.encode(first, zeros(first)))
+    inputs = mailbox.take(0, 0)
+    assert (inputs.used.used_position_counter, inputs.used.used_attitude_counter) == (NO_COUNTER, NO_COUNTER)
+    for cycle in range(1, 40):  # every cycle falls between the two frames of a sample
+        mailbox.put(cycle * 10_000_000, *late)
+        mailbox.put(cycle * 10_000_000, *side.encode(first, zeros(first) | {"position_x_m": 0.01 * cycle}))
+        late = side.encode(second, zeros(second) | {"yaw_rad": 0.01 * cycle})
+        inputs = mailbox.take(cycle * 10_000, 0)
+        assert inputs.used.used_position_counter == inputs.used.used_attitude_counter == (cycle - 1) % 15
+        assert inputs.position.position_x_m == pytest.approx(0.01 * (cycle - 1), abs=1e-5)
+        assert inputs.attitude.yaw_rad == pytest.approx(0.01 * (cycle - 1), abs=1e-5)
 
 
 @pytest.mark.parametrize("name", [n for n in STRUCTS if n.startswith("CTRL")])
@@ -278,7 +316,8 @@ def test_the_plants_side_cuts_as_the_firmware_does(name: str) -> None:
 
 def report_frames(name: str, count: int) -> list[tuple[int, bytes]]:
     sender = Sender(CODEC)
-    return [sender.pack(name, CODEC.unpack[name](bytes(8))) for _ in range(count)]
+    values = CODEC.unpack[name](bytes(8))._replace(**{bit: 1 for bit, _ in VALID_BITS.get(name, ())})
+    return [sender.pack(name, values) for _ in range(count)]
 
 
 def test_before_any_frame_everything_is_zero_and_nothing_is_new() -> None:
@@ -299,12 +338,15 @@ def test_inputs_carry_each_message_in_its_own_field() -> None:
         mailbox = Mailbox(CODEC)
         values = STRUCTS[name]._make([1] * len(payload(name)))
         mailbox.put(0, *Sender(CODEC).pack(name, values))
+        expected = [used[name]]
+        if name in PAIR:  # handed out with its partner only
+            partner = PAIR[name == PAIR[0]]
+            mailbox.put(0, *Sender(CODEC).pack(partner, CODEC.unpack[partner](bytes(8))))
+            expected = [used[each] for each in PAIR]
         inputs = mailbox.take(0, 0)
         assert getattr(inputs, fields[name]) != CODEC.unpack[name](bytes(8))
-        assert [key for key, counter in inputs.used._asdict().items() if counter == 0] == [
-            used[name],
-            "overruns_before_cycle",
-        ]
+        new = [key for key, counter in inputs.used._asdict().items() if counter == 0]
+        assert new == [*expected, "overruns_before_cycle"]
 
 
 def test_a_value_is_new_once_and_stays_known() -> None:

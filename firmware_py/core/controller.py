@@ -12,7 +12,7 @@ from firmware_py.core import conditions as c
 from firmware_py.core import gate as last_gate
 from firmware_py.core import health, limits, manoeuvre, observer, pid, predictor, speed, supervisor
 from firmware_py.core.motion import PathState
-from firmware_py.core.path import feedforward_at
+from firmware_py.core.path import feedforward_at, plan_at
 from firmware_py.core.schedule import Gains, gains_at
 from firmware_py.core.signals import (
     GEAR_NONE,
@@ -55,7 +55,7 @@ class State(NamedTuple):
     limited: int
     sent_angles_rad: tuple[float, ...]
     angle_carry_rad: float
-    speed_sent_mps: float
+    speed_mps: float
     standstill: int
 
 
@@ -72,7 +72,7 @@ def begin() -> State:
         limited=0,
         sent_angles_rad=(0.0,) * predictor.QUEUE_LENGTH,
         angle_carry_rad=0.0,
-        speed_sent_mps=0.0,
+        speed_mps=0.0,
         standstill=0,
     )
 
@@ -109,11 +109,15 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
 
     # Where the car is, and where it will be when this cycle's command acts.
     travel_mps = leg.sigma * inputs.motion.speed_meas_mps
+    if c.has(conditions, c.MOTION_REPORT_TIMEOUT):
+        # The car is being stopped, unseen: it is taken to slow down as the brake commands.
+        travel_mps = leg.sigma * state.speed_mps
+        travel_mps = max(travel_mps - car.controlled_decel_mps2 * dt_s, 0.0)
     if standstill:
         travel_mps = 0.0
     gains = gains_at(tables.gains, direction, max(travel_mps, 0.0))
     observed = _observe(
-        tables, leg, gains, observed, state, inputs, health_state.pose_is_new, travel_mps, standstill, dt_s
+        tables, leg, gains, observed, state, inputs, health_state.pose_is_new, travel_mps, standstill, active, dt_s
     )
     if not active and not stopping_on_path:
         observed = _rest_angle(observed, inputs.steer.road_wheel_angle_meas_rad)
@@ -151,30 +155,30 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         tables.road_wheel_angle_lsb_rad,
         decided.mode,
         decided.reaction,
-        standstill,
+        decided.released,
         leg.sigma,
         last_gate.Wanted(
-            angle_rad=limited.angle_rad,
-            travel_speed_mps=speed_command.travel_speed_mps,
-            brake_decel_mps2=speed_command.brake_decel_mps2,
+            limited.angle_rad,
+            speed_command.travel_speed_mps,
+            speed_command.brake_decel_mps2,
         ),
         state.sent_angles_rad[0],
         state.angle_carry_rad,
         PERIOD_S,
     )
     next_state = State(
-        last_us=inputs.now_us,
-        health=health_state,
-        supervisor=decided,
-        manoeuvre=leg_state,
-        observer=observed,
-        speed=reference,
-        integral_m2=integral_m2,
-        limited=limited.limited,
-        sent_angles_rad=(passed.angle_rad, *state.sent_angles_rad[:-1]),
-        angle_carry_rad=passed.angle_carry_rad,
-        speed_sent_mps=passed.speed_mps,
-        standstill=1 if standstill else 0,
+        inputs.now_us,
+        health_state,
+        decided,
+        leg_state,
+        observed,
+        reference,
+        integral_m2,
+        limited.limited,
+        (passed.angle_rad, *state.sent_angles_rad[:-1]),
+        passed.angle_carry_rad,
+        leg.sigma * travel_mps,
+        1 if standstill else 0,
     )
     return next_state, _outputs(decided, leg_state, passed, observed, standstill)
 
@@ -188,17 +192,21 @@ def _elapsed_s(last_us: int, now_us: int) -> float:
 
 def _believed(tables: Tables, state: State) -> health.Believed:
     path = state.observer.path
+    leg = tables.leg[manoeuvre.direction_of(state.manoeuvre.leg)]
+    planned_mps, _accel_mps2 = plan_at(leg, path.station_m)
     return health.Believed(
-        mode=state.supervisor.mode,
-        direction_sigma=tables.leg[manoeuvre.direction_of(state.manoeuvre.leg)].sigma,
-        driving=state.manoeuvre.driving,
-        cross_track_error_m=path.cross_track_error_m,
-        heading_error_rad=path.heading_error_rad,
-        station_m=path.station_m,
-        disbelieved=state.observer.disbelieved,
-        averaged=state.observer.averaged,
-        model_angle_rad=path.road_wheel_angle_rad,
-        speed_sent_mps=state.speed_sent_mps,
+        state.supervisor.mode,
+        leg.sigma,
+        state.manoeuvre.driving,
+        state.speed.stopping,
+        planned_mps,
+        path.station_m - leg.length_m,
+        path.cross_track_error_m,
+        path.heading_error_rad,
+        path.station_m,
+        state.observer.disbelieved,
+        state.observer.averaged,
+        path.road_wheel_angle_rad,
     )
 
 
@@ -218,7 +226,7 @@ def _manoeuvre(state: State, car: CarTable, inputs: Inputs, mode: int, standstil
         )
     if mode == MODE_FAULT:
         kept = state.manoeuvre
-        return manoeuvre.ManoeuvreState(leg=kept.leg, driving=0, waiting_us=0, steering_us=0, gear_failed=0)
+        return manoeuvre.ManoeuvreState(kept.leg, 0, 0, 0, 0)
     return manoeuvre.begin()
 
 
@@ -232,6 +240,7 @@ def _observe(
     pose_is_new: int,
     travel_mps: float,
     standstill: bool,
+    active: bool,
     dt_s: float,
 ) -> observer.ObserverState:
     """Return the observer at the age of the newest pose, predicted by odometry and corrected if a pose arrived."""
@@ -243,6 +252,8 @@ def _observe(
     error = observer.innovation(
         leg, observed, inputs.position.position_x_m, inputs.position.position_y_m, inputs.attitude.yaw_rad
     )
+    if active and not observer.is_believable(error):
+        return observer.disbelieve(observed)
     if standstill:
         return observer.correct_standing(observed, error)
     return observer.correct_moving(observed, gains, error)
@@ -252,26 +263,26 @@ def _rest_angle(observed: observer.ObserverState, angle_rad: float) -> observer.
     """Return the observer with the wheels where they are measured: nothing is commanded, so nothing is modelled."""
     path = observed.path
     return observer.ObserverState(
-        path=PathState(
-            station_m=path.station_m,
-            cross_track_error_m=path.cross_track_error_m,
-            heading_error_rad=path.heading_error_rad,
-            curvature_disturbance_1pm=path.curvature_disturbance_1pm,
-            road_wheel_angle_rad=angle_rad,
+        PathState(
+            path.station_m,
+            path.cross_track_error_m,
+            path.heading_error_rad,
+            path.curvature_disturbance_1pm,
+            angle_rad,
         ),
-        averaged=observed.averaged,
-        disbelieved=observed.disbelieved,
+        observed.averaged,
+        observed.disbelieved,
     )
 
 
 def _unpredicted(path: PathState, station_m: float) -> PathState:
     """Return the errors as they are at the pose's age, for a law that predicts nothing but the station."""
     return PathState(
-        station_m=station_m,
-        cross_track_error_m=path.cross_track_error_m,
-        heading_error_rad=path.heading_error_rad,
-        curvature_disturbance_1pm=path.curvature_disturbance_1pm,
-        road_wheel_angle_rad=path.road_wheel_angle_rad,
+        station_m,
+        path.cross_track_error_m,
+        path.heading_error_rad,
+        path.curvature_disturbance_1pm,
+        path.road_wheel_angle_rad,
     )
 
 
@@ -320,25 +331,25 @@ def _outputs(
         park_brake = 1
     path = observed.path
     return Outputs(
-        sys=SysCommand(
-            enable_request=enable,
-            clear_request=clear,
-            control_mode=decided.mode,
-            control_leg=leg,
-            control_reason=decided.reason,
+        SysCommand(
+            enable,
+            clear,
+            decided.mode,
+            leg,
+            decided.reason,
         ),
-        steer=SteerCommand(road_wheel_angle_cmd_rad=passed.angle_rad, steer_enable=passed.follow),
-        long=LongCommand(
-            speed_cmd_mps=passed.speed_mps,
-            brake_decel_cmd_mps2=passed.brake_decel_mps2,
-            gear_cmd=gear,
-            park_brake_cmd=park_brake,
-            long_enable=passed.follow,
+        SteerCommand(passed.angle_rad, passed.follow),
+        LongCommand(
+            passed.speed_mps,
+            passed.brake_decel_mps2,
+            gear,
+            park_brake,
+            passed.follow,
         ),
-        track=Track(
-            station_m=max(path.station_m, 0.0),
-            cross_track_error_est_m=path.cross_track_error_m,
-            heading_error_est_rad=path.heading_error_rad,
-            curvature_disturbance_est_1pm=path.curvature_disturbance_1pm,
+        Track(
+            max(path.station_m, 0.0),
+            path.cross_track_error_m,
+            path.heading_error_rad,
+            path.curvature_disturbance_1pm,
         ),
     )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from firmware_py.core.signals import MODE_ACTIVE, MODE_FAULT
 from firmware_py.core.speed import HOLD_DECEL_MPS2
-from firmware_py.core.supervisor import STOP_EMERGENCY, STOP_RELEASE
+from firmware_py.core.supervisor import STOP_EMERGENCY
 from firmware_py.core.tables import CarTable
 
 
@@ -41,7 +41,7 @@ def gate(
     lsb_rad: float,
     mode: int,
     reaction: int,
-    standstill: bool,
+    released: int,
     sigma: float,
     wanted: Wanted,
     previous_rad: float,
@@ -50,8 +50,9 @@ def gate(
 ) -> Passed:
     """Return the commands that may leave the controller.
 
-    Active: the wanted commands, bounded. Fault: steering goes on to follow the path until standstill and the brake
-    stops the car, unless the driver has taken over. Otherwise nothing is to be followed: brake held, no speed.
+    Active: the wanted commands, bounded. Fault: steering goes on to follow the path while the brake stops the car,
+    until it has stood or the driver has taken over (`released`). Otherwise nothing is to be followed: brake held, no
+    speed.
     """
     angle_rad = wanted.angle_rad
     if not is_number(angle_rad):
@@ -70,9 +71,9 @@ def gate(
         brake_mps2 = car.controlled_decel_mps2
         if reaction == STOP_EMERGENCY:
             brake_mps2 = car.emergency_decel_mps2
-        if standstill:
+        if released != 0:
             angle_rad = previous_rad
-        elif reaction != STOP_RELEASE:
+        else:
             follow = 1
     else:
         speed_mps = 0.0
@@ -91,9 +92,9 @@ def gate(
     sent_rad = math.floor(angle_rad / lsb_rad + 0.5) * lsb_rad
     remainder_rad = max(min(angle_rad - sent_rad, lsb_rad), -lsb_rad)
     return Passed(
-        angle_rad=sent_rad,
-        angle_carry_rad=remainder_rad,
-        speed_mps=sigma * speed_mps,
-        brake_decel_mps2=brake_mps2,
-        follow=follow,
+        sent_rad,
+        remainder_rad,
+        sigma * speed_mps,
+        brake_mps2,
+        follow,
     )

@@ -15,7 +15,10 @@ from firmware_py.core.signals import (
     QUALITY_FIXED,
     Inputs,
 )
-from firmware_py.core.tables import CarTable, Tables
+from firmware_py.core.tables import Tables
+
+PROTOCOL = 1
+"""Version of the rules of the bus (CONVENTIONS.md) that the controller follows."""
 
 NEVER_US = 60_000_000
 """Age of a report that was never received."""
@@ -35,8 +38,18 @@ STEERING_GAP_RAD = 0.08
 STEERING_GAP_US = 300_000
 """The measured angle may differ from the nominal actuator's by what the slowest rack of the vehicle file explains."""
 
-SPEED_GAP_MPS = 0.30
-SPEED_GAP_US = 500_000
+SPEED_GAP_MPS = 0.25
+SPEED_GAP_US = 300_000
+"""Faster than planned at the car's place by so much for so long: the drive does not obey."""
+
+STUCK_MPS = 0.01
+STUCK_US = 3_000_000
+"""Asked to drive and not moving for so long: it would set off when whatever holds it gives way."""
+
+BEYOND_END_M = 0.10
+"""Past the end of the leg by so much: the stop has failed."""
+
+ROLLING_MPS = 0.03
 
 WRONG_DIRECTION_MPS = 0.03
 WRONG_DIRECTION_US = 60_000
@@ -80,11 +93,9 @@ class HealthState(NamedTuple):
     rejected_us: int
     overrun_bucket: int
     overrun_leak: int
-    model_speed_mps: float
+    stuck_us: int
     start_was_pressed: int
     clear_was_pressed: int
-    position_counter: int
-    attitude_counter: int
     pose_is_new: int
 
 
@@ -94,13 +105,15 @@ class Believed(NamedTuple):
     mode: int
     direction_sigma: float
     driving: int
+    stopping: int
+    planned_mps: float
+    beyond_end_m: float
     cross_track_error_m: float
     heading_error_rad: float
     station_m: float
     disbelieved: int
     averaged: int
     model_angle_rad: float
-    speed_sent_mps: float
 
 
 def begin() -> HealthState:
@@ -122,30 +135,18 @@ def begin() -> HealthState:
         rejected_us=0,
         overrun_bucket=0,
         overrun_leak=0,
-        model_speed_mps=0.0,
+        stuck_us=0,
         start_was_pressed=0,
         clear_was_pressed=0,
-        position_counter=NO_COUNTER,
-        attitude_counter=NO_COUNTER,
         pose_is_new=0,
     )
 
 
-def _newest(counter: int, used_counter: int) -> int:
-    if used_counter != NO_COUNTER:
-        return used_counter
-    return counter
-
-
-def _pose_is_new(inputs: Inputs, position_counter: int, attitude_counter: int) -> bool:
-    """Return whether a usable pose is complete now: position and yaw of one sample, both of full quality.
-
-    The two frames of a sample may come in two cycles; they belong together when their counters are equal.
-    """
-    arrived = inputs.used.used_position_counter != NO_COUNTER or inputs.used.used_attitude_counter != NO_COUNTER
+def _pose_is_new(inputs: Inputs) -> bool:
+    """Return whether a usable pose arrived: position and yaw of one sample (equal counters), both of full quality."""
     return (
-        arrived
-        and position_counter == attitude_counter
+        inputs.used.used_position_counter != NO_COUNTER
+        and inputs.used.used_position_counter == inputs.used.used_attitude_counter
         and inputs.position.position_quality == QUALITY_FIXED
         and inputs.attitude.yaw_quality == QUALITY_FIXED
     )
@@ -163,13 +164,13 @@ def _older(ages: Ages, inputs: Inputs, pose_is_new: bool, passed_us: int) -> Age
     steer_is_new = used.used_steer_counter != NO_COUNTER and inputs.steer.steer_angle_valid != 0
     motion_is_new = used.used_motion_counter != NO_COUNTER and inputs.motion.speed_valid != 0
     return Ages(
-        sys_us=_age_us(ages.sys_us, used.used_sys_counter != NO_COUNTER, passed_us),
-        steer_us=_age_us(ages.steer_us, steer_is_new, passed_us),
-        motion_us=_age_us(ages.motion_us, motion_is_new, passed_us),
-        long_us=_age_us(ages.long_us, used.used_long_counter != NO_COUNTER, passed_us),
-        pose_us=_age_us(ages.pose_us, pose_is_new, passed_us),
-        oper_us=_age_us(ages.oper_us, used.used_oper_counter != NO_COUNTER, passed_us),
-        version_us=_age_us(ages.version_us, used.used_veh_version_counter != NO_COUNTER, passed_us),
+        _age_us(ages.sys_us, used.used_sys_counter != NO_COUNTER, passed_us),
+        _age_us(ages.steer_us, steer_is_new, passed_us),
+        _age_us(ages.motion_us, motion_is_new, passed_us),
+        _age_us(ages.long_us, used.used_long_counter != NO_COUNTER, passed_us),
+        _age_us(ages.pose_us, pose_is_new, passed_us),
+        _age_us(ages.oper_us, used.used_oper_counter != NO_COUNTER, passed_us),
+        _age_us(ages.version_us, used.used_veh_version_counter != NO_COUNTER, passed_us),
     )
 
 
@@ -197,32 +198,31 @@ def assess(
         leak = 0
         bucket = max(bucket - 1, 0)
 
-    model_speed_mps = _model_speed(car, state.model_speed_mps, believed, moving_allowed, speed_mps, period_us)
     rejecting = (
         inputs.sys.sys_cmd_timeout != 0 or inputs.steer.steer_cmd_timeout != 0 or inputs.long.long_cmd_timeout != 0
     )
-    position_counter = _newest(state.position_counter, used.used_position_counter)
-    attitude_counter = _newest(state.attitude_counter, used.used_attitude_counter)
-    pose_is_new = _pose_is_new(inputs, position_counter, attitude_counter)
+    pose_is_new = _pose_is_new(inputs)
     ages = _older(state.ages, inputs, pose_is_new, period_us)
     steering_gap = active and abs(inputs.steer.road_wheel_angle_meas_rad - believed.model_angle_rad) > STEERING_GAP_RAD
-    speed_gap = moving_allowed and abs(speed_mps - model_speed_mps) > SPEED_GAP_MPS
-    wrong_direction = active and speed_mps * believed.direction_sigma < -WRONG_DIRECTION_MPS
+    speed_gap = moving_allowed and speed_mps * believed.direction_sigma > believed.planned_mps + SPEED_GAP_MPS
+    stuck = moving_allowed and believed.stopping == 0 and abs(speed_mps) < STUCK_MPS
+    wrong_direction = active and (
+        speed_mps * believed.direction_sigma < -WRONG_DIRECTION_MPS
+        or (believed.driving == 0 and abs(speed_mps) > ROLLING_MPS)
+    )
     pose_is_new_flag = 1 if pose_is_new else 0
     next_state = HealthState(
-        ages=ages,
-        steering_gap_us=_lasting_us(state.steering_gap_us, steering_gap, period_us),
-        speed_gap_us=_lasting_us(state.speed_gap_us, speed_gap, period_us),
-        wrong_direction_us=_lasting_us(state.wrong_direction_us, wrong_direction, period_us),
-        rejected_us=_lasting_us(state.rejected_us, active and rejecting, period_us),
-        overrun_bucket=bucket,
-        overrun_leak=leak,
-        model_speed_mps=model_speed_mps,
-        start_was_pressed=inputs.oper.oper_start,
-        clear_was_pressed=inputs.oper.oper_clear,
-        position_counter=position_counter,
-        attitude_counter=attitude_counter,
-        pose_is_new=pose_is_new_flag,
+        ages,
+        _lasting_us(state.steering_gap_us, steering_gap, period_us),
+        _lasting_us(state.speed_gap_us, speed_gap, period_us),
+        _lasting_us(state.wrong_direction_us, wrong_direction, period_us),
+        _lasting_us(state.rejected_us, active and rejecting, period_us),
+        bucket,
+        leak,
+        _lasting_us(state.stuck_us, stuck, period_us),
+        inputs.oper.oper_start,
+        inputs.oper.oper_clear,
+        pose_is_new_flag,
     )
 
     sys, steer, long, oper = inputs.sys, inputs.steer, inputs.long, inputs.oper
@@ -240,7 +240,11 @@ def assess(
         or abs(believed.station_m) > START_POSITION_M
         or abs(believed.heading_error_rad) > START_HEADING_RAD
     )
-    off_path = abs(believed.cross_track_error_m) > OFF_PATH_M or abs(believed.heading_error_rad) > OFF_PATH_HEADING_RAD
+    off_path = (
+        abs(believed.cross_track_error_m) > OFF_PATH_M
+        or abs(believed.heading_error_rad) > OFF_PATH_HEADING_RAD
+        or (moving_allowed and believed.beyond_end_m > BEYOND_END_M)
+    )
     over_speed = abs(speed_mps) > OVER_SPEED_SHARE * car.max_speed_mps + OVER_SPEED_MPS
     overrun = overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET
 
@@ -249,7 +253,9 @@ def assess(
         present |= 1 << c.WAITING_FOR_REPORTS
     if oper_lost:
         present |= 1 << c.WAITING_FOR_OPERATOR
-    if not version_lost and inputs.version.veh_dbc_hash != tables.dbc_hash24:
+    if not version_lost and (
+        inputs.version.veh_dbc_hash != tables.dbc_hash24 or inputs.version.veh_protocol != PROTOCOL
+    ):
         present |= 1 << c.DBC_HASH_MISMATCH
     if not version_lost and inputs.version.veh_vehicle_hash != tables.vehicle_hash24:
         present |= 1 << c.VEHICLE_HASH_MISMATCH
@@ -300,7 +306,7 @@ def assess(
         present |= 1 << c.OVER_SPEED
     if next_state.steering_gap_us >= STEERING_GAP_US:
         present |= 1 << c.STEERING_NOT_FOLLOWING
-    if next_state.speed_gap_us >= SPEED_GAP_US:
+    if next_state.speed_gap_us >= SPEED_GAP_US or next_state.stuck_us >= STUCK_US:
         present |= 1 << c.SPEED_NOT_FOLLOWING
     if next_state.wrong_direction_us >= WRONG_DIRECTION_US:
         present |= 1 << c.WRONG_DIRECTION
@@ -315,13 +321,3 @@ def assess(
     if oper.oper_clear != 0 and state.clear_was_pressed == 0 and not oper_lost:
         present |= 1 << c.CLEAR_PRESSED
     return next_state, present
-
-
-def _model_speed(
-    car: CarTable, model_mps: float, believed: Believed, moving_allowed: bool, speed_mps: float, period_us: int
-) -> float:
-    """Return the speed that the nominal drive would have; at rest, and while stopping, it is the measured one."""
-    if not moving_allowed:
-        return speed_mps
-    share = period_us * 1e-6 / (car.drive_lag_s + period_us * 1e-6)
-    return model_mps + share * (believed.speed_sent_mps - model_mps)

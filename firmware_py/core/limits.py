@@ -23,4 +23,4 @@ def limit_angle(car: CarTable, angle_rad: float, previous_rad: float, period_s: 
     limited = 0
     if abs(bounded_rad - angle_rad) > 1e-9:
         limited = 1
-    return LimitedAngle(angle_rad=bounded_rad, limited=limited)
+    return LimitedAngle(bounded_rad, limited)

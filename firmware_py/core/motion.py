@@ -1,6 +1,6 @@
 """The nominal motion along the path: the one model that the observer and the predictor share.
 
-Kinematics of the rear-axle centre per metre of travel, body curvature c (DESIGN of the law: left positive, sigma = +1
+Kinematics of the rear-axle centre per metre of travel, body curvature c (left positive, sigma = +1
 forward and -1 in reverse):
 
     de = sigma sin(heading error) ds,    d(heading error) = sigma (c + d - k) ds
@@ -47,9 +47,9 @@ def advance(
     heading_change_rad = leg.sigma * ((curvature_1pm + disturbance_1pm) * ds_m - reference_1pm * path_ds_m)
     mean_heading_rad = heading_rad + 0.5 * heading_change_rad
     return PathState(
-        station_m=station_m + path_ds_m,
-        cross_track_error_m=cross_m + leg.sigma * math.sin(mean_heading_rad) * ds_m,
-        heading_error_rad=heading_rad + heading_change_rad,
-        curvature_disturbance_1pm=disturbance_1pm,
-        road_wheel_angle_rad=angle_rad + change_rad,
+        station_m + path_ds_m,
+        cross_m + leg.sigma * math.sin(mean_heading_rad) * ds_m,
+        heading_rad + heading_change_rad,
+        disturbance_1pm,
+        angle_rad + change_rad,
     )

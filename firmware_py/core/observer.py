@@ -56,15 +56,15 @@ def turn_round(leg: LegTable, observer: ObserverState) -> ObserverState:
     """
     path = observer.path
     return ObserverState(
-        path=PathState(
-            station_m=leg.length_m - path.station_m,
-            cross_track_error_m=path.cross_track_error_m,
-            heading_error_rad=path.heading_error_rad,
-            curvature_disturbance_1pm=path.curvature_disturbance_1pm,
-            road_wheel_angle_rad=path.road_wheel_angle_rad,
+        PathState(
+            leg.length_m - path.station_m,
+            path.cross_track_error_m,
+            path.heading_error_rad,
+            path.curvature_disturbance_1pm,
+            path.road_wheel_angle_rad,
         ),
-        averaged=PRIOR_SAMPLES,
-        disbelieved=0,
+        PRIOR_SAMPLES,
+        0,
     )
 
 
@@ -73,9 +73,9 @@ def predict_to_pose(
 ) -> ObserverState:
     """Return the observer one cycle later, driven by the command that acted at the pose's age and by odometry."""
     return ObserverState(
-        path=advance(leg, car, observer.path, angle_cmd_rad, travel_speed_mps, dt_s),
-        averaged=observer.averaged,
-        disbelieved=observer.disbelieved,
+        advance(leg, car, observer.path, angle_cmd_rad, travel_speed_mps, dt_s),
+        observer.averaged,
+        observer.disbelieved,
     )
 
 
@@ -84,9 +84,9 @@ def innovation(leg: LegTable, observer: ObserverState, x_m: float, y_m: float, y
     path = observer.path
     measured = pose_error(pose_at(leg, path.station_m), leg.sigma, x_m, y_m, yaw_rad)
     return PoseError(
-        along_m=measured.along_m,
-        cross_track_error_m=measured.cross_track_error_m - path.cross_track_error_m,
-        heading_error_rad=measured.heading_error_rad - path.heading_error_rad,
+        measured.along_m,
+        measured.cross_track_error_m - path.cross_track_error_m,
+        measured.heading_error_rad - path.heading_error_rad,
     )
 
 
@@ -94,12 +94,26 @@ def _corrected(
     path: PathState, station_m: float, cross_m: float, heading_rad: float, curvature_1pm: float
 ) -> PathState:
     return PathState(
-        station_m=path.station_m + station_m,
-        cross_track_error_m=path.cross_track_error_m + cross_m,
-        heading_error_rad=path.heading_error_rad + heading_rad,
-        curvature_disturbance_1pm=path.curvature_disturbance_1pm + curvature_1pm,
-        road_wheel_angle_rad=path.road_wheel_angle_rad,
+        path.station_m + station_m,
+        path.cross_track_error_m + cross_m,
+        path.heading_error_rad + heading_rad,
+        path.curvature_disturbance_1pm + curvature_1pm,
+        path.road_wheel_angle_rad,
     )
+
+
+def is_believable(error: PoseError) -> bool:
+    """Return whether a pose is within the gate around the observed one."""
+    return (
+        abs(error.cross_track_error_m) <= GATE_CROSS_M
+        and abs(error.along_m) <= GATE_CROSS_M
+        and abs(error.heading_error_rad) <= GATE_HEADING_RAD
+    )
+
+
+def disbelieve(observer: ObserverState) -> ObserverState:
+    """Return the observer untouched by a pose that is not believed, which is counted."""
+    return ObserverState(observer.path, observer.averaged, observer.disbelieved + 1)
 
 
 def correct_standing(observer: ObserverState, error: PoseError) -> ObserverState:
@@ -107,36 +121,32 @@ def correct_standing(observer: ObserverState, error: PoseError) -> ObserverState
     averaged = min(observer.averaged + 1, AVERAGING_MAX)
     share = 1.0 / averaged
     return ObserverState(
-        path=_corrected(
+        _corrected(
             observer.path,
             share * error.along_m,
             share * error.cross_track_error_m,
             share * error.heading_error_rad,
             0.0,
         ),
-        averaged=averaged,
-        disbelieved=0,
+        averaged,
+        0,
     )
 
 
 def correct_moving(observer: ObserverState, gains: Gains, error: PoseError) -> ObserverState:
     """Return the observer corrected by a pose taken on the move; a pose beyond the gate is not believed."""
-    if (
-        abs(error.cross_track_error_m) > GATE_CROSS_M
-        or abs(error.along_m) > GATE_CROSS_M
-        or abs(error.heading_error_rad) > GATE_HEADING_RAD
-    ):
-        return ObserverState(path=observer.path, averaged=0, disbelieved=observer.disbelieved + 1)
+    if not is_believable(error):
+        return disbelieve(observer)
     cross_m = error.cross_track_error_m
     heading_rad = error.heading_error_rad
     return ObserverState(
-        path=_corrected(
+        _corrected(
             observer.path,
             STATION_GAIN * error.along_m,
             gains.l_ee * cross_m + gains.l_ep * heading_rad,
             gains.l_pe * cross_m + gains.l_pp * heading_rad,
             gains.l_de * cross_m + gains.l_dp * heading_rad,
         ),
-        averaged=0,
-        disbelieved=0,
+        0,
+        0,
     )

@@ -66,15 +66,15 @@ def locate(leg: LegTable, station_m: float) -> PathPoint:
     yaw_rad = a * leg.yaw_rad[row] + b * leg.yaw_rad[n]
     travel_m = leg.sigma * beyond_m
     return PathPoint(
-        x_m=a * leg.x_m[row] + b * leg.x_m[n] + travel_m * math.cos(yaw_rad),
-        y_m=a * leg.y_m[row] + b * leg.y_m[n] + travel_m * math.sin(yaw_rad),
-        yaw_rad=yaw_rad,
-        curvature_1pm=a * leg.curvature_1pm[row] + b * leg.curvature_1pm[n],
-        slip_heading_rad=a * leg.slip_heading_rad[row] + b * leg.slip_heading_rad[n],
-        feedforward_curvature_1pm=a * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[n],
-        feedforward_slope_1pm2=a * leg.feedforward_slope_1pm2[row] + b * leg.feedforward_slope_1pm2[n],
-        speed_mps=a * leg.speed_mps[row] + b * leg.speed_mps[n],
-        accel_mps2=a * leg.accel_mps2[row] + b * leg.accel_mps2[n],
+        a * leg.x_m[row] + b * leg.x_m[n] + travel_m * math.cos(yaw_rad),
+        a * leg.y_m[row] + b * leg.y_m[n] + travel_m * math.sin(yaw_rad),
+        yaw_rad,
+        a * leg.curvature_1pm[row] + b * leg.curvature_1pm[n],
+        a * leg.slip_heading_rad[row] + b * leg.slip_heading_rad[n],
+        a * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[n],
+        a * leg.feedforward_slope_1pm2[row] + b * leg.feedforward_slope_1pm2[n],
+        a * leg.speed_mps[row] + b * leg.speed_mps[n],
+        a * leg.accel_mps2[row] + b * leg.accel_mps2[n],
     )
 
 
@@ -89,10 +89,10 @@ def pose_at(leg: LegTable, station_m: float) -> PathPose:
     yaw_rad = a * leg.yaw_rad[row] + b * leg.yaw_rad[n]
     travel_m = leg.sigma * beyond_m
     return PathPose(
-        x_m=a * leg.x_m[row] + b * leg.x_m[n] + travel_m * math.cos(yaw_rad),
-        y_m=a * leg.y_m[row] + b * leg.y_m[n] + travel_m * math.sin(yaw_rad),
-        yaw_rad=yaw_rad,
-        slip_heading_rad=a * leg.slip_heading_rad[row] + b * leg.slip_heading_rad[n],
+        a * leg.x_m[row] + b * leg.x_m[n] + travel_m * math.cos(yaw_rad),
+        a * leg.y_m[row] + b * leg.y_m[n] + travel_m * math.sin(yaw_rad),
+        yaw_rad,
+        a * leg.slip_heading_rad[row] + b * leg.slip_heading_rad[n],
     )
 
 
@@ -137,7 +137,7 @@ def pose_error(point: PathPoint | PathPose, sigma: float, x_m: float, y_m: float
     cos_yaw = math.cos(point.yaw_rad)
     sin_yaw = math.sin(point.yaw_rad)
     return PoseError(
-        along_m=sigma * (dx * cos_yaw + dy * sin_yaw),
-        cross_track_error_m=dy * cos_yaw - dx * sin_yaw,
-        heading_error_rad=wrap_angle(yaw_rad - point.yaw_rad - point.slip_heading_rad),
+        sigma * (dx * cos_yaw + dy * sin_yaw),
+        dy * cos_yaw - dx * sin_yaw,
+        wrap_angle(yaw_rad - point.yaw_rad - point.slip_heading_rad),
     )

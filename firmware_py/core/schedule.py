@@ -55,14 +55,14 @@ def gains_at(table: GainTable, direction: int, travel_speed_mps: float) -> Gains
     low = table.gain[direction][row]
     high = table.gain[direction][row + 1]
     return Gains(
-        preview_m=a * low[PREVIEW] + b * high[PREVIEW],
-        kp=a * low[KP] + b * high[KP],
-        ki=a * low[KI] + b * high[KI],
-        kd=a * low[KD] + b * high[KD],
-        l_ee=a * low[L_EE] + b * high[L_EE],
-        l_ep=a * low[L_EP] + b * high[L_EP],
-        l_pe=a * low[L_PE] + b * high[L_PE],
-        l_pp=a * low[L_PP] + b * high[L_PP],
-        l_de=a * low[L_DE] + b * high[L_DE],
-        l_dp=a * low[L_DP] + b * high[L_DP],
+        a * low[PREVIEW] + b * high[PREVIEW],
+        a * low[KP] + b * high[KP],
+        a * low[KI] + b * high[KI],
+        a * low[KD] + b * high[KD],
+        a * low[L_EE] + b * high[L_EE],
+        a * low[L_EP] + b * high[L_EP],
+        a * low[L_PE] + b * high[L_PE],
+        a * low[L_PP] + b * high[L_PP],
+        a * low[L_DE] + b * high[L_DE],
+        a * low[L_DP] + b * high[L_DP],
     )

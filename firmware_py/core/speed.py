@@ -51,7 +51,7 @@ class SpeedCommand(NamedTuple):
 
 def hold() -> SpeedCommand:
     """Return the command that keeps the car at standstill."""
-    return SpeedCommand(travel_speed_mps=0.0, brake_decel_mps2=HOLD_DECEL_MPS2)
+    return SpeedCommand(0.0, HOLD_DECEL_MPS2)
 
 
 def follow(
@@ -67,8 +67,8 @@ def follow(
     braking_m = speed_mps * (car.brake_lag_s + 0.5 * dt_s) + 0.5 * speed_mps * speed_mps / STOP_DECEL_MPS2
     if state.stopping != 0 or remaining_m <= braking_m:
         return (
-            SpeedState(reference_station_m=leg.length_m, accel_mps2=0.0, stopping=1),
-            SpeedCommand(travel_speed_mps=0.0, brake_decel_mps2=STOP_DECEL_MPS2),
+            SpeedState(leg.length_m, 0.0, 1),
+            SpeedCommand(0.0, STOP_DECEL_MPS2),
         )
     planned_mps, planned_mps2 = plan_at(leg, state.reference_station_m)
     station_m = min(state.reference_station_m + planned_mps * dt_s, leg.length_m)
@@ -82,7 +82,9 @@ def follow(
     accel_mps2 = max(min(accel_mps2, state.accel_mps2 + eased_mps2), state.accel_mps2 - eased_mps2)
     accel_mps2 = max(min(accel_mps2, ACCEL_LIMIT_MPS2), -ACCEL_LIMIT_MPS2)
     command_mps = max(min(speed_mps + lag_s * accel_mps2, car.max_speed_mps), CREEP_MPS)
+    # What the clamps took away is not remembered: the next easing starts from what was asked for.
+    accel_mps2 = min(accel_mps2, (command_mps - speed_mps) / lag_s)
     return (
-        SpeedState(reference_station_m=station_m, accel_mps2=accel_mps2, stopping=0),
-        SpeedCommand(travel_speed_mps=command_mps, brake_decel_mps2=0.0),
+        SpeedState(station_m, accel_mps2, 0),
+        SpeedCommand(command_mps, 0.0),
     )

@@ -17,6 +17,12 @@ STOP_RELEASE = 3
 ENABLE_TIMEOUT_US = 1_000_000
 """How long the vehicle may take to become Active after the request."""
 
+CONTROLLED_STOP_US = 3_000_000
+"""A controlled stop that lasts longer does not decelerate as it should: from there on the emergency brake."""
+
+LONGEST_STOP_US = 10_000_000
+"""After so long in Fault the vehicle is released even if no standstill was seen: its own brake then holds it."""
+
 CLEAR_PULSE_US = 200_000
 """How long the clear request is held: twice the vehicle's command timeout."""
 
@@ -43,6 +49,8 @@ _STOPPING = (
     (c.DRIVER_OVERRIDE, STOP_RELEASE),
     (c.EMERGENCY_STOP, STOP_EMERGENCY),
     (c.SECOND_CONTROLLER, STOP_EMERGENCY),
+    (c.DBC_HASH_MISMATCH, STOP_CONTROLLED),
+    (c.VEHICLE_HASH_MISMATCH, STOP_CONTROLLED),
     (c.CYCLE_OVERRUN, STOP_CONTROLLED),
     (c.SYS_REPORT_TIMEOUT, STOP_CONTROLLED),
     (c.VEHICLE_FAULT, STOP_EMERGENCY),
@@ -61,7 +69,6 @@ _STOPPING = (
     (c.OPERATOR_TIMEOUT, STOP_CONTROLLED),
     (c.OPERATOR_STOP, STOP_CONTROLLED),
     (c.DIRECTION_CHANGE_TIMEOUT, STOP_CONTROLLED),
-    (c.INTERNAL_ERROR, STOP_EMERGENCY),
 )
 
 
@@ -105,8 +112,15 @@ def _any_required(mode: int) -> int:
 _ANY_REQUIRED = tuple(_any_required(mode) for mode in range(4))
 
 
+_EMERGENCIES = _mask(*(reason for reason, reaction in _STOPPING if reaction == STOP_EMERGENCY))
+
+
 class SupervisorState(NamedTuple):
-    """The mode, why, what a fault asks for, and how long the present request to the vehicle has lasted."""
+    """The mode, why, what a fault asks for, and how long the present request to the vehicle has lasted.
+
+    `released` is latched in a fault: once the car has stood, or the driver has it, nothing is asked of the vehicle
+    until the operator has cleared the fault. `fault_us` is how long the fault has lasted.
+    """
 
     mode: int
     reason: int
@@ -114,12 +128,21 @@ class SupervisorState(NamedTuple):
     enabling: int
     enabling_us: int
     clearing_us: int
+    released: int
+    fault_us: int
 
 
 def begin() -> SupervisorState:
     """Return the state before the first cycle."""
     return SupervisorState(
-        mode=MODE_MANUAL, reason=c.WAITING_FOR_REPORTS, reaction=STOP_NONE, enabling=0, enabling_us=0, clearing_us=0
+        mode=MODE_MANUAL,
+        reason=c.WAITING_FOR_REPORTS,
+        reaction=STOP_NONE,
+        enabling=0,
+        enabling_us=0,
+        clearing_us=0,
+        released=0,
+        fault_us=0,
     )
 
 
@@ -159,13 +182,23 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
 
     row = find_transition(state.mode, seen)
     if row < 0:
+        reaction = _escalated(state, conditions)
+        fault_us = 0
+        released = 0
+        if state.mode == MODE_FAULT:
+            fault_us = min(state.fault_us + period_us, LONGEST_STOP_US)
+            released = state.released
+            if c.has(conditions, c.STANDSTILL) or reaction == STOP_RELEASE or fault_us >= LONGEST_STOP_US:
+                released = 1
         return SupervisorState(
-            mode=state.mode,
-            reason=state.reason,
-            reaction=_escalated(state, conditions),
-            enabling=enabling,
-            enabling_us=enabling_us,
-            clearing_us=clearing_us,
+            state.mode,
+            state.reason,
+            reaction,
+            enabling,
+            enabling_us,
+            clearing_us,
+            released,
+            fault_us,
         )
     mode = TRANSITIONS[row][3]
     reason = TRANSITIONS[row][4]
@@ -175,12 +208,14 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
     if state.mode == MODE_MANUAL and mode == MODE_MANUAL:
         reason = _manual_reason(state.reason, reason)
     return SupervisorState(
-        mode=mode,
-        reason=reason,
-        reaction=TRANSITIONS[row][5],
-        enabling=enabling,
-        enabling_us=enabling_us,
-        clearing_us=clearing_us,
+        mode,
+        reason,
+        TRANSITIONS[row][5],
+        enabling,
+        enabling_us,
+        clearing_us,
+        1 if TRANSITIONS[row][5] == STOP_RELEASE else 0,
+        0,
     )
 
 
@@ -190,9 +225,7 @@ def _escalated(state: SupervisorState, conditions: int) -> int:
         return state.reaction
     if c.has(conditions, c.DRIVER_OVERRIDE):
         return STOP_RELEASE
-    if state.reaction == STOP_CONTROLLED and (
-        c.has(conditions, c.EMERGENCY_STOP) or c.has(conditions, c.VEHICLE_FAULT)
-    ):
+    if state.reaction == STOP_CONTROLLED and ((conditions & _EMERGENCIES) != 0 or state.fault_us >= CONTROLLED_STOP_US):
         return STOP_EMERGENCY
     return state.reaction
 
