@@ -185,21 +185,29 @@ def test_the_limits_are_those_of_the_controller() -> None:
         f"{health.STEERING_GAP_RAD:.2f} rad",
         f"{health.STEERING_GAP_US * us:g} s",
     )
-    assert rows["speed against the nominal drive's, while driving"] == (
+    assert rows["faster than planned at the car's place, while driving"] == (
         f"{health.SPEED_GAP_MPS:.2f} m/s",
         f"{health.SPEED_GAP_US * us:g} s",
     )
-    assert rows["speed against the direction of the leg"] == (
+    assert rows["no motion, while asked to drive"] == (f"{health.STUCK_MPS:g} m/s", f"{health.STUCK_US * us:g} s")
+    assert health.ROLLING_MPS == health.WRONG_DIRECTION_MPS
+    assert rows["speed against the direction of the leg, or any while to be held"] == (
         f"{health.WRONG_DIRECTION_MPS:g} m/s",
         f"{health.WRONG_DIRECTION_US * us:g} s",
     )
     over = f"{health.OVER_SPEED_SHARE:g} x `max_speed_mps` + {health.OVER_SPEED_MPS:g} m/s"
     assert rows["speed"] == (over, "at once")
     assert rows["pose against its prediction"] == (
-        f"{observer.GATE_CROSS_M:g} m across or {observer.GATE_HEADING_RAD:g} rad",
+        f"{observer.GATE_CROSS_M:.2f} m along or across, or {observer.GATE_HEADING_RAD:g} rad",
         f"{health.JUMPS_IN_A_ROW} poses in a row",
     )
-    assert rows["distance from the path"][0] == (f"{health.OFF_PATH_M:.2f} m or {health.OFF_PATH_HEADING_RAD:.2f} rad")
+    assert rows["distance from the path"][0] == (
+        f"{health.OFF_PATH_M:.2f} m or {health.OFF_PATH_HEADING_RAD:.2f} rad, "
+        f"or {health.BEYOND_END_M:.2f} m past its end"
+    )
+    assert rows["cycles of its own that it skipped"][0] == (
+        f"{health.OVERRUNS_AT_ONCE} in one stall, {health.OVERRUN_BUCKET} together"
+    )
     assert (
         rows["`sys_cmd_timeout`, `steer_cmd_timeout` or `long_cmd_timeout` set"][1] == f"{health.REJECTED_US * us:g} s"
     )
