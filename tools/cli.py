@@ -22,6 +22,7 @@ COMMANDS = {
         "tools.deploy.command",
         "what goes into the car: the wheel of the controller alone, with its systemd units",
     ),
+    "bench": ("tools.bench.command", "what the controller costs: jitter, tick, codec, turnaround, beside their floors"),
     "guest": ("tools.guest.command", "run a command where a real vcan0 is, on any Linux on x86-64, without root"),
 }
 """Subcommand: (module with add_arguments(parser) and run(args) -> exit status, what it is for)."""
@@ -33,7 +34,7 @@ PROCESSES = {
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "deploy", "guest")
+ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "deploy", "bench", "guest")
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2
