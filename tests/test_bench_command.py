@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from sim.errors import UserError
-from tools import cli
-from tools.bench import command, pictures, rows, wake
+from tools import cli, plots
+from tools.bench import command, rows, wake
 from tools.bench.recording import record
 from tools.bench.rows import LIMITS, Row, quantile, row_of
 
@@ -86,12 +86,18 @@ def test_without_cyclictest_the_wake_rows_say_why(monkeypatch, tmp_path, capsys)
 
 
 def test_the_table_shows_value_limits_and_verdict_in_80_columns(capsys):
-    command._print(Console(width=80), [row_of("tick_cold_p50", [262.5], [40.0]), row_of("rss_mib", [35.5])])
+    measured = {
+        name: row_of(name, [13773.4], [100.0] if limit.against else ()) for name, limit in LIMITS.items() if limit.must
+    }
+    measured |= {"tick_cold_p50": row_of("tick_cold_p50", [261.5], [39.5]), "rss_mib": row_of("rss_mib", [35.5])}
+    command._print(Console(width=80), [measured.get(name, Row(name, why="not here")) for name in LIMITS])
     shown = capsys.readouterr().out
-    assert "263 us" in shown.replace("262 us", "263 us")
-    assert "OVER" in shown
+    line = next(line for line in shown.splitlines() if "tick_cold_p50" in line)
+    for text in ("262 us", "39.5", "6.62", "≤ 2", "≤ 1.4", "OVER"):
+        assert text in line
     assert "35.5 MiB" in shown
     assert "the same source compiled" in shown
+    assert "not measured: not here" in shown
     assert "…" not in shown
 
 
@@ -145,7 +151,7 @@ def test_a_hog_ends_by_itself_when_its_parent_is_gone():
 
 
 def test_histograms_are_drawn(tmp_path):
-    pictures.histogram(tmp_path / "h.png", "title", {"one": [1.0, 2.0, 3.0], "other": [0.0, 100.0]})
+    plots.histogram(tmp_path / "h.png", "title", {"one": [1.0, 2.0, 3.0], "other": [0.0, 100.0]})
     assert (tmp_path / "h.png").read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["h.png"]
 

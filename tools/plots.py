@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ LABEL_ROOM_M = 0.6
 MAX_LEGS = 4
 """A test has two; one that went wrong may have any number."""
 DPI = 130
+BINS, LEAST_US = 80, 0.05
 
 
 def swept_body(
@@ -182,6 +183,20 @@ def signals(
 def _limits(axes: Axes, limit: float, label: str) -> None:
     axes.axhline(limit, color="black", ls="--", lw=1.0, label=f"{label} ±{limit:g}")
     axes.axhline(-limit, color="black", ls="--", lw=1.0)
+
+
+def histogram(file: Path, title: str, samples_us: Mapping[str, Sequence[float]]) -> None:
+    """Draw one histogram a name over the same logarithmic axis in us."""
+    least = max(min(min(samples) for samples in samples_us.values()), LEAST_US)
+    most = max(2.0 * least, *(max(samples) for samples in samples_us.values()))
+    edges = [float(edge) for edge in np.geomspace(least, most, BINS)]
+    figure, axes = plt.subplots(figsize=(9, 4.5), layout="constrained")
+    for name, samples in samples_us.items():
+        axes.hist(np.maximum(samples, least), bins=edges, histtype="step", linewidth=1.5, label=name)
+    axes.set(xscale="log", yscale="log", xlabel="us", ylabel="samples", title=title)
+    axes.legend()
+    axes.grid(alpha=0.3)
+    _save(figure, file)
 
 
 def _save(figure: Any, file: Path) -> None:

@@ -259,7 +259,7 @@ class Bench:
 
     def draw(self, folder: Path) -> None:
         """Write the histograms of what was measured."""
-        from tools.bench.pictures import histogram  # noqa: PLC0415 -- matplotlib
+        from tools.plots import histogram  # noqa: PLC0415 -- matplotlib
 
         for stem, title, prefix, loaded in (
             ("wake", "lateness of wake-ups, idle", "wake ", False),
