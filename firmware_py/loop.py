@@ -144,7 +144,8 @@ class Loop:
         seen = node.seen()
         if seen.mode == MODE_MANUAL and seen.reason == c.COMPLETE:
             self._completed = True
-        if self._signalled and not node.stop_requested:
+        if self._signalled or (self._once and self._completed):
+            # Once is once: a start that is pressed again finds the stop button held.
             node.stop_requested = True
         if not self._completed or seen.mode == MODE_FAULT:
             self._reason = seen.reason

@@ -549,6 +549,7 @@ def ratio(fast: Any, slow: Any) -> float:
     return min(a for a, _ in pairs) / min(b for _, b in pairs)
 
 
+@pytest.mark.live  # a ratio of times: with nothing of ours beside it
 def test_the_codec_is_several_times_faster_than_cantools() -> None:
     name = "VEH_SteerRpt"
     message = MESSAGES[name]
@@ -560,6 +561,7 @@ def test_the_codec_is_several_times_faster_than_cantools() -> None:
     assert ratio(lambda: CODEC.unpack[name](data), lambda: message.decode(data, decode_choices=False)) < 0.5
 
 
+@pytest.mark.live  # a ratio of times: with nothing of ours beside it
 def test_a_frame_in_costs_less_than_one_cantools_decode() -> None:
     """`Mailbox.put` with length, CRC, counter and unpacking against cantools' decode alone."""
     frames = report_frames("VEH_MotionRpt", 15)
