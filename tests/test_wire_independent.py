@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import pytest
 
-from firmware_py.codec import STRUCTS, Mailbox, Sender, load_codec
+from firmware_py.codec import PAIR, STRUCTS, Mailbox, Sender, load_codec
 from sim.can_side import CanSide
 
 DBC = Path(__file__).resolve().parent.parent / "dbc/parking.dbc"
@@ -103,11 +103,15 @@ def test_the_controller_understands_an_independent_plant(name: str) -> None:
     scales = {field.name: field.scale for field in LAYOUT[name][1]}
     for cycle in range(100):
         raws = random_raws(name, rng)
+        raws |= {key: 1 for key in raws if key.endswith("_valid")}  # what is not valid is not taken over
         mailbox.put(cycle * 10_000_000, *encode(name, raws, cycle % 15))
+        if name in PAIR:  # handed out with its partner only
+            partner = PAIR[name == PAIR[0]]
+            mailbox.put(cycle * 10_000_000, *encode(partner, {}, cycle % 15))
         inputs = mailbox.take(0, 0)
         wanted = STRUCTS[name](**{key: raw * scales[key] for key, raw in raws.items()})
         assert wanted in inputs[2:-1]
-    assert mailbox.received == 100
+    assert mailbox.received == (200 if name in PAIR else 100)
 
 
 @pytest.mark.parametrize("name", [n for n in LAYOUT if n.startswith("CTRL")])
