@@ -1,24 +1,20 @@
-"""Pictures of a run. The only module that imports matplotlib; it draws into files and needs no display."""
+"""Pictures of a run: the swept body, the signals, histograms."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Polygon
 
 from sim.body import Outline, clearance_array_m, outline_of, polygon
 from sim.data_files import Course, Side, Vehicle
 from tools.figures import FORWARD, Leg, PathTable, Truth, command_rate, leg_figures
-
-mpl.use("Agg")
-logging.getLogger("matplotlib").setLevel(logging.ERROR)  # building its font cache is nobody's news
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.patches import Circle, Polygon  # noqa: E402
 
 COLOUR = {FORWARD: "tab:blue", "reverse": "tab:red"}
 OUTLINE_STEP_M = 0.25
