@@ -13,7 +13,7 @@ from firmware_py.codec import INPUT_MESSAGES, Codec, load_codec
 from firmware_py.core.controller import PERIOD_S, PERIOD_US
 from firmware_py.core.signals import MODE_FAULT
 from firmware_py.errors import UserError
-from firmware_py.loop import Loop, RunResult, status_writer
+from firmware_py.loop import Clock, Loop, RunResult, status_writer
 from firmware_py.node import ControllerNode, build_tables
 from firmware_py.rates import RateWatch
 from firmware_py.realtime import set_up
@@ -26,6 +26,8 @@ DEFAULT_TABLES = HERE / "tables" / "paper-ohio"
 # Beside the package in the source tree, inside it where the controller alone is installed.
 DBC_FOLDER = HERE / "dbc" if (HERE / "dbc").is_dir() else HERE.parent / "dbc"
 DEFAULT_DBC = DBC_FOLDER / "parking.dbc"
+
+SLOWEST_MOTION = 1000
 
 EXIT_DONE = 0
 EXIT_MISTAKE = 2
@@ -59,6 +61,10 @@ def build_parser() -> argparse.ArgumentParser:
         help="use of SCHED_FIFO (required on a physical interface, auto on loopbus, virtual and vcan*)",
     )
     parser.add_argument("--cpu", type=int, metavar="N", help="stay on this CPU")
+    parser.add_argument(
+        "--slow-motion", type=int, default=1, metavar="N",
+        help="a second of the loop lasts N: for an emulated machine that cannot keep up, never for a car",
+    )  # fmt: skip
     parser.add_argument("--once", action="store_true", help="end after one manoeuvre, or after a fault once it stands")
     parser.add_argument("--status", action="store_true", help="write a JSON line to standard output every 0.2 s")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the flight record")
@@ -96,6 +102,10 @@ def _run(options: argparse.Namespace) -> int:
     tables = build_tables(table_set, codec)
     if options.out is not None and not options.out.is_dir():
         raise UserError(f"--out {options.out}: no such folder")
+    if not 1 <= options.slow_motion <= SLOWEST_MOTION:
+        raise UserError(f"--slow-motion {options.slow_motion}: must be from 1 to {SLOWEST_MOTION}")
+    if options.preflight and options.slow_motion != 1:
+        raise UserError("--slow-motion: a car is not checked in slow motion; leave it out with --preflight")
     bus = _open(options, codec)
     try:
         policy = options.realtime or ("required" if bus.is_physical else "auto")
@@ -117,7 +127,9 @@ def _run(options: argparse.Namespace) -> int:
         silent = "; listening only, nothing is sent" if options.listen_only else ""
         print(f"controller on {bus.description}: {outcome.line}{silent}", file=sys.stderr, flush=True)
         rates = RateWatch(codec.messages, PERIOD_US // 1000)
-        loop = Loop(node, bus, rates, realtime=outcome, once=options.once, status_fd=status_writer(options.status))
+        status_fd = status_writer(options.status)
+        clock = Clock(options.slow_motion)
+        loop = Loop(node, bus, rates, realtime=outcome, once=options.once, status_fd=status_fd, clock=clock)
         result = loop.run()
     finally:
         bus.close()

@@ -30,6 +30,9 @@ SPIN_NS = 200_000
 REGATHER_S = 0.001
 """After a stall, so long is given to peers that stalled with us before their silence is judged."""
 
+LATE_NS = 1_000_000
+"""A cycle that starts later than this counts as late: a tenth of the period."""
+
 LISTEN_NS = 150_000_000
 """Before the first frame is sent, the bus is listened to for so long: longer than a controller's timeout."""
 
@@ -39,6 +42,25 @@ ENDING_CYCLES = 30
 
 STOPPING_CYCLES = 1500
 """A stop that takes longer than this (15 s) is given up: the vehicle's watchdog takes over."""
+
+
+class Clock:
+    """The loop's time: the monotonic clock, or the same in slow motion.
+
+    In slow motion by N a second of the loop lasts N seconds. Nothing of the loop, the law or the timeouts changes with
+    it: all of them know this time only.
+    """
+
+    def __init__(self, slow_motion: int = 1) -> None:
+        self.slow_motion = slow_motion
+        self.now_ns: Callable[[], int] = time.monotonic_ns if slow_motion == 1 else self._slow_ns
+
+    def _slow_ns(self) -> int:
+        return time.monotonic_ns() // self.slow_motion
+
+    def sleep(self, duration_s: float) -> None:
+        """Sleep for so long of this time, s."""
+        time.sleep(duration_s * self.slow_motion)
 
 
 class RunResult(NamedTuple):
@@ -61,17 +83,20 @@ class Loop:
         realtime: Outcome,
         once: bool,
         status_fd: int | None,
+        clock: Clock | None = None,
     ) -> None:
+        self._clock = clock or Clock()
         self._node = node
         self._bus = bus
         self._rates = rates
-        self._spin_ns = SPIN_NS if realtime.fifo else 0
+        self._spin_ns = SPIN_NS if realtime.fifo and self._clock.slow_motion == 1 else 0
         self._realtime = realtime
         self._once = once
         self._status_fd = status_fd
         self._wake = Histogram()
         self._step = Histogram()
         self._longest_stall = 0
+        self._late_cycles = 0
         self._signalled = False
         self._stopping_cycles = 0
         self._reason = c.WAITING_FOR_REPORTS
@@ -93,18 +118,19 @@ class Loop:
 
     def _listen_first(self) -> None:
         """Refuse a bus on which another controller already sends: two senders would fight over the car."""
-        end_ns = time.monotonic_ns() + LISTEN_NS
-        while time.monotonic_ns() < end_ns and not self._signalled:
+        end_ns = self._clock.now_ns() + LISTEN_NS
+        while self._clock.now_ns() < end_ns and not self._signalled:
             for arbitration_id, data in self._bus.drain():
-                self._node.mailbox.put(time.monotonic_ns(), arbitration_id, data)
+                self._node.mailbox.put(self._clock.now_ns(), arbitration_id, data)
             if self._node.mailbox.second_controller:
                 raise UserError(f"another controller already sends on {self._bus.description}; stop it first")
-            time.sleep(0.002)
+            self._clock.sleep(0.002)
 
     def _cycles(self) -> None:
         node = self._node
         bus = self._bus
-        deadline_ns = (time.monotonic_ns() // PERIOD_NS + 2) * PERIOD_NS
+        clock = self._clock
+        deadline_ns = (clock.now_ns() // PERIOD_NS + 2) * PERIOD_NS
         ending = 0
         while ending < ENDING_CYCLES:
             wake_ns = self._wait_until(deadline_ns)
@@ -115,12 +141,14 @@ class Loop:
             frames = bus.drain()
             if overruns:
                 self._longest_stall = max(self._longest_stall, overruns)
-                time.sleep(REGATHER_S)
+                clock.sleep(REGATHER_S)
                 frames += bus.drain()
             frames = self._rates.sift(frames, 1 + overruns, holding=not node.is_driving)
             bus.send(node.cycle(wake_ns, frames, overruns, bus.send_failed))
 
-            step_ns = time.monotonic_ns() - wake_ns
+            step_ns = clock.now_ns() - wake_ns
+            if late_ns > LATE_NS:
+                self._late_cycles += 1
             self._wake.add(late_ns)
             self._step.add(step_ns)
             node.health.add(late_ns, step_ns)
@@ -130,12 +158,13 @@ class Loop:
 
     def _wait_until(self, deadline_ns: int) -> int:
         """Sleep, then spin where that helps; return the time of waking, never before the deadline."""
-        rest_ns = deadline_ns - self._spin_ns - time.monotonic_ns()
+        clock = self._clock
+        rest_ns = deadline_ns - self._spin_ns - clock.now_ns()
         if rest_ns > 0:
-            time.sleep(rest_ns * 1e-9)
-        now_ns = time.monotonic_ns()
+            clock.sleep(rest_ns * 1e-9)
+        now_ns = clock.now_ns()
         while now_ns < deadline_ns:
-            now_ns = time.monotonic_ns()
+            now_ns = clock.now_ns()
         return now_ns
 
     def _ending(self, ending: int) -> int:
@@ -172,6 +201,7 @@ class Loop:
                 "held_reports": list(self._rates.held.values()),
                 "wake_late_p99_us": self._wake.quantile_us(0.99),
                 "overruns": self._node.overruns,
+                "late_cycles": self._late_cycles,
             }
         )
         try:
@@ -193,6 +223,7 @@ class Loop:
             "completed": self._completed,
             "cycles": node.cycles,
             "overruns": node.overruns,
+            "late_cycles": self._late_cycles,
             "longest_stall_cycles": self._longest_stall,
             "wake_p50_us": self._wake.quantile_us(0.5),
             "wake_p99_us": self._wake.quantile_us(0.99),

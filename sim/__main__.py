@@ -34,6 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DEFAULT_DBC = ROOT / "dbc" / "parking.dbc"
 PERIOD_NS = 10_000_000
 LISTEN_S = 0.25
+SLOWEST_MOTION = 1000
 STATUS_TICKS = 20
 MOST_FRAMES_A_TURN = 256
 OLDEST_STAMP_NS = 10_000_000_000
@@ -73,6 +74,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     how.add_argument("--duration", type=float, metavar="S", help="end by itself after this time")
     how.add_argument("--realtime", choices=("auto", "off", "required"), default="auto", help="use of SCHED_FIFO")
+    how.add_argument(
+        "--slow-motion", type=int, default=1, metavar="N",
+        help="a second of the plant lasts N, for a machine that cannot keep up; N must be the controller's too",
+    )  # fmt: skip
     how.add_argument("--status", action="store_true", help="one JSON line on standard output every 0.2 s")
     how.add_argument("--out", type=Path, metavar="DIR", help="folder for truth.csv and exam.json, written at the end")
     return parser
@@ -97,6 +102,8 @@ def _run(options: argparse.Namespace) -> int:
         raise UserError(f"--phase-ms {options.phase_ms:g}: must be from 0 to less than 10")
     if options.duration is not None and not options.duration > 0.0:
         raise UserError(f"--duration {options.duration:g}: must be more than 0")
+    if not 1 <= options.slow_motion <= SLOWEST_MOTION:
+        raise UserError(f"--slow-motion {options.slow_motion}: must be from 1 to {SLOWEST_MOTION}")
     vehicle, course = load_vehicle(options.vehicle), load_course(options.course)
     scenario = load_scenario(options.scenario)
     phase_ns = round(options.phase_ms * 1e6)
@@ -112,17 +119,28 @@ def _run(options: argparse.Namespace) -> int:
     bus = _open_bus(options.interface, options.channel, options.bitrate)
     try:
         realtime = set_up(options.realtime)
-        _refuse_second_vehicle(bus, own_ids)
-        emulator = make(_tick_after(time.monotonic_ns(), phase_ns))
+        _refuse_second_vehicle(bus, own_ids, LISTEN_S * options.slow_motion)
+        clock = _Clock(options.slow_motion)
+        emulator = make(_tick_after(clock.now_ns(), phase_ns))
         print(f"plant emulator on {bus.channel_info}: {realtime}", file=sys.stderr, flush=True)
         duration_ns = None if options.duration is None else round(options.duration * 1e9)
-        _Loop(emulator, bus, status=options.status, end=end).run(duration_ns)
+        _Loop(emulator, bus, clock, status=options.status, end=end).run(duration_ns)
     finally:
         with contextlib.suppress(Exception):
             bus.shutdown()
     if options.out is not None:
         write_results(emulator, options.out)
     return EXIT_DONE
+
+
+class _Clock:
+    """The plant's time: the monotonic clock, or the same in slow motion, where a second of it lasts several."""
+
+    def __init__(self, slow_motion: int) -> None:
+        self.slow_motion = slow_motion
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns() // self.slow_motion
 
 
 class _EndSignal:
@@ -145,11 +163,14 @@ def _tick_after(now_ns: int, phase_ns: int) -> int:
 class _Loop:
     """Frames in as they come, reports out on the grid."""
 
-    def __init__(self, emulator: "Emulator", bus: "can.BusABC", *, status: bool, end: _EndSignal) -> None:
+    def __init__(
+        self, emulator: "Emulator", bus: "can.BusABC", clock: _Clock, *, status: bool, end: _EndSignal
+    ) -> None:
         import can  # noqa: PLC0415  loaded by now
 
         self._emulator = emulator
         self._bus = bus
+        self._clock = clock
         self._end = end
         self._message = can.Message
         self._bus_errors = (can.CanError, OSError)
@@ -166,7 +187,7 @@ class _Loop:
         end_ns = None if duration_ns is None else tick_ns + duration_ns
         while True:
             frames = self._frames_until(tick_ns)
-            missed = (time.monotonic_ns() - tick_ns) // PERIOD_NS
+            missed = (self._clock.now_ns() - tick_ns) // PERIOD_NS
             if missed > 0:
                 tick_ns += missed * PERIOD_NS
             later = []
@@ -193,8 +214,8 @@ class _Loop:
         """
         waiting: list[tuple[int, int, bytes]] = []
         while True:
-            rest_ns = tick_ns - time.monotonic_ns()
-            frame = self._receive(rest_ns * 1e-9 if rest_ns > 0 else 0.0)
+            rest_ns = tick_ns - self._clock.now_ns()
+            frame = self._receive(rest_ns * 1e-9 * self._clock.slow_motion if rest_ns > 0 else 0.0)
             if frame is not None:
                 if rest_ns > 0 and frame[0] <= tick_ns:
                     self._emulator.receive(*frame)
@@ -215,10 +236,10 @@ class _Loop:
             return None
         if message is None or message.is_error_frame or message.is_remote_frame or message.is_extended_id:
             return None
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.now_ns()
         age_ns = time.time_ns() - round(message.timestamp * 1e9)
         if 0 < age_ns < OLDEST_STAMP_NS:  # else the driver's stamps are of another clock
-            now_ns -= age_ns
+            now_ns -= age_ns // self._clock.slow_motion
         self._arrived_ns = max(self._arrived_ns, now_ns)
         return self._arrived_ns, message.arbitration_id, bytes(message.data)
 
@@ -258,6 +279,7 @@ def status_of(emulator: "Emulator") -> dict[str, Any]:
         "clearance_m": row.min_clearance_m,
         "cones_touched": emulator.examiner.cones_touched,
         "rejected": emulator.rejected_count,
+        "lost": emulator.lost_count,
     }
 
 
@@ -295,9 +317,9 @@ def _open_bus(interface: str, channel: str | None, bitrate: int | None) -> "can.
         raise UserError(text if text.startswith(interface) else f"-i {interface} -c {channel}: {text}") from None
 
 
-def _refuse_second_vehicle(bus: "can.BusABC", own_ids: set[int]) -> None:
+def _refuse_second_vehicle(bus: "can.BusABC", own_ids: set[int], listen_s: float) -> None:
     """Listen for a while: two vehicles under the same ids would be one that jumps."""
-    end_s = time.monotonic() + LISTEN_S
+    end_s = time.monotonic() + listen_s
     while (rest_s := end_s - time.monotonic()) > 0.0:
         message = bus.recv(rest_s)
         if message is not None and not message.is_error_frame and message.arbitration_id in own_ids:

@@ -46,7 +46,8 @@ _CRC_TABLE = _make_crc_table()
 class Reception:
     """One received message: its flags as the reports carry them, and the state of its counter check.
 
-    `bad_crc` and `bad_counter` speak of the last frame; `last_valid_ns` is None before the first valid one.
+    `bad_crc` and `bad_counter` speak of the last frame; `last_valid_ns` is None before the first valid one;
+    `lost_count` are the frames that the accepted counters have skipped.
     """
 
     def __init__(self, message: Message, timeout_ns: int, decoded: bool) -> None:
@@ -59,6 +60,7 @@ class Reception:
         self.bad_counter = False
         self.last_valid_ns: int | None = None
         self.rejected_count = 0
+        self.lost_count = 0
         self._accepted: int | None = None
         self._stray: list[int] = []  # counters in a row that follow each other but not the accepted one
         self._heard_ns = 0
@@ -84,6 +86,8 @@ class Reception:
             self._stray = [*self._stray, counter] if self._stray and _follows(counter, self._stray[-1]) else [counter]
             if len(self._stray) < _RUN_TO_RESYNC:
                 return False
+        elif self._accepted is not None and not silent:
+            self.lost_count += (counter - self._accepted - 1) % _COUNTERS
         self._accepted = counter
         self._stray = []
         return True
@@ -122,6 +126,11 @@ class CanSide:
     def rejected_count(self) -> int:
         """Frames of other nodes that were rejected, for whatever reason."""
         return sum(reception.rejected_count for reception in self.received.values())
+
+    @property
+    def lost_count(self) -> int:
+        """Frames of other nodes that are missing between accepted ones."""
+        return sum(reception.lost_count for reception in self.received.values())
 
     def timeout_ns(self, name: str) -> int:
         """Return the message's timeout as the DBC gives it."""

@@ -202,6 +202,11 @@ class Emulator:
         """Frames of the controller and the operator that were rejected."""
         return self._wire.rejected_count
 
+    @property
+    def lost_count(self) -> int:
+        """Frames of the controller and the operator that are missing between accepted ones."""
+        return self._wire.lost_count
+
     # -- hooks for faults by hand -------------------------------------------------------------------------------------
 
     def driver(self, control: str, active: bool) -> None:

@@ -34,6 +34,7 @@ COMPLETE = "Complete"
 NO_REASON = "None"
 CLEAR_HOLD_S = 0.5
 START_HOLD_S = 0.3
+SLOWEST_MOTION = 1000
 POLL_S = 0.005
 """Longest wait of a loop that plays the station: a quarter of the heartbeat's cycle time."""
 
@@ -157,6 +158,10 @@ class Station:
             self._ready_ns = now_ns
         self.start = bool(self._ready_ns) and now_ns - self._ready_ns < int(1e9 * START_HOLD_S)
 
+    def allow_another_start(self) -> None:
+        """Let `press_start_when_ready` press start again: for one more test with the same car."""
+        self._has_driven = False
+
 
 def text_of_state(station: Station, now_ns: int) -> str:
     """Return one line on how controller and vehicle are."""
@@ -186,6 +191,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="no keys: press start when the controller is Ready, end when it has finished",
     )
+    parser.add_argument(
+        "--slow-motion", type=int, default=1, metavar="N", help="a second lasts N, as with drive and emulate"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -195,12 +203,14 @@ def run(args: argparse.Namespace) -> int:
     """
     if not args.auto and not sys.stdin.isatty():
         raise UserError("operate: its keys need a terminal; use --auto to press start without one")
+    if not 1 <= args.slow_motion <= SLOWEST_MOTION:
+        raise UserError(f"--slow-motion {args.slow_motion}: must be from 1 to {SLOWEST_MOTION}")
     station = Station(Path(args.dbc))
     interface, channel = args.interface, args.channel
     if interface is None and not _is_configured():
         interface = "loopbus"
     with opened(open_bus(interface, channel, args.bitrate, ignore_settings=interface is not None)) as bus:
-        return _Console(station, bus, auto=args.auto).run()
+        return _Console(station, bus, auto=args.auto, slow_motion=args.slow_motion).run()
 
 
 def _is_configured() -> bool:
@@ -212,7 +222,8 @@ def _is_configured() -> bool:
 class _Console:
     """The station with its keys and its lines."""
 
-    def __init__(self, station: Station, bus: can.BusABC, *, auto: bool) -> None:
+    def __init__(self, station: Station, bus: can.BusABC, *, auto: bool, slow_motion: int) -> None:
+        self._slow_motion = slow_motion
         self._station = station
         self._bus = bus
         self._auto = auto
@@ -237,8 +248,8 @@ class _Console:
     def _loop(self) -> int:
         station = self._station
         while True:
-            now_ns = time.monotonic_ns()
-            exchange(self._bus, station)
+            now_ns = time.monotonic_ns() // self._slow_motion
+            exchange(self._bus, station, self._slow_motion)
             if not self._auto:
                 self._keys(now_ns)
             station.clear = now_ns < self._clear_until_ns
@@ -297,16 +308,17 @@ def _without_speed(text: str) -> str:
     return " ".join(word for word in text.split() if word[0] not in "+-" and word != "m/s")
 
 
-def exchange(bus: can.BusABC, station: Station) -> list[tuple[float, int, bytes, bool]]:
+def exchange(bus: can.BusABC, station: Station, slow_motion: int = 1) -> list[tuple[float, int, bytes, bool]]:
     """Send the heartbeat if due, take in all that has come, and wait at most POLL_S for more.
 
     Returns (Unix time in s, arbitration id, data, is error frame) of every frame, the station's own included. A frame
-    that the driver refuses is not sent again: the next heartbeat follows within its cycle time.
+    that the driver refuses is not sent again: the next heartbeat follows within its cycle time. A second of the station
+    lasts `slow_motion` seconds.
     """
     import can  # noqa: PLC0415
 
     seen: list[tuple[float, int, bytes, bool]] = []
-    now_ns = time.monotonic_ns()
+    now_ns = time.monotonic_ns() // slow_motion
     frame = station.heartbeat(now_ns)
     if frame is not None:
         with contextlib.suppress(can.CanError, OSError):
@@ -325,7 +337,7 @@ def exchange(bus: can.BusABC, station: Station) -> list[tuple[float, int, bytes,
         data = bytes(message.data)
         seen.append((message.timestamp, message.arbitration_id, data, message.is_error_frame))
         if not (message.is_error_frame or message.is_extended_id or message.is_remote_frame):
-            station.hear(time.monotonic_ns(), message.arbitration_id, data)
+            station.hear(time.monotonic_ns() // slow_motion, message.arbitration_id, data)
     return seen
 
 

@@ -9,7 +9,7 @@ import json
 import sys
 import time
 
-from firmware_py.loop import PERIOD_NS, SPIN_NS, Loop
+from firmware_py.loop import PERIOD_NS, SPIN_NS, Clock, Loop
 from firmware_py.realtime import set_up
 
 
@@ -20,6 +20,7 @@ class _Pace:
 
     def __init__(self, spin_ns: int) -> None:
         self._spin_ns = spin_ns
+        self._clock = Clock()
 
 
 def main() -> None:
