@@ -1,12 +1,15 @@
 """The vehicle's drive-by-wire system: its states, its watchdog, the gear, and which commands it follows.
 
-Decides, but moves nothing: the emulator asks it what the actuators are to do. All times are nanoseconds of the
+Decides, but moves nothing: the plant asks it what the actuators are to do. All times are nanoseconds of the
 emulator's clock. States, reasons and the handshake are those of dbc/parking.dbc and dbc/CONVENTIONS.md.
+
+The system lives in a record, a mutable row of integers whose slots are named below; the functions work on it in place.
+In the live emulator the record is a list, compiled it is an array of int64: the same source for both.
 """
 
-from collections.abc import Mapping
+from collections.abc import MutableSequence
 from enum import IntEnum
-from typing import Any
+from typing import NamedTuple
 
 BRAKE_DECEL_MPS2 = 2.4
 """Deceleration with which the vehicle brakes by itself, and holds itself at standstill."""
@@ -52,199 +55,234 @@ class Gear(IntEnum):
     DRIVE = 4
 
 
+# The same as plain integers: a compiler knows no enumerations.
+MANUAL, READY, ACTIVE, FAULT = (int(state) for state in State)
+NO_REASON = int(Reason.NONE)
+NO_COMMAND = int(Reason.NO_COMMAND)
+NOT_AT_STANDSTILL = int(Reason.NOT_AT_STANDSTILL)
+ENABLE_HELD_AT_START = int(Reason.ENABLE_HELD_AT_START)
+DISABLED_BY_CONTROLLER = int(Reason.DISABLED_BY_CONTROLLER)
+COMMAND_TIMEOUT = int(Reason.COMMAND_TIMEOUT)
+DRIVER_OVERRIDE = int(Reason.DRIVER_OVERRIDE)
+EMERGENCY_STOP = int(Reason.EMERGENCY_STOP)
+NO_GEAR, PARK, REVERSE, NEUTRAL, DRIVE = (int(gear) for gear in Gear)
+
 WATCHED = ("CTRL_SysCmd", "CTRL_SteerCmd", "CTRL_LongCmd")
 """Commands without which an Active vehicle stops."""
 
+TIMED = (*WATCHED, "CTRL_Version")
+"""Messages whose age is known; the indices below are places in this row."""
+
+SYS, STEER, LONG, VERSION = range(4)
+
 NEVER = 1 << 62
 
+# Slots of the record.
+(
+    STATE,
+    REASON,
+    GEAR,
+    PARK_BRAKE_APPLIED,
+    OVERRIDE_LATCHED,
+    STEERING_OVERRIDE,
+    BRAKE_OVERRIDE,
+    BUTTON_PRESSED,  # the emergency-stop button in the car
+    OPERATOR_ESTOP,
+    FIRST_ACTIVE_NS,  # NEVER until then
+    ACTIVE_SINCE_NS,
+    CONTROL_LEG,
+    # Next instant at which `at` must be called: the end of a gear change, or the earliest at which the watchdog may
+    # bite; commands that come meanwhile only postpone it, so `at` then looks again.
+    NEXT_EVENT_NS,
+    GEAR_WANTED,
+    GEAR_DONE_NS,
+    ENABLE,  # the request in the last CTRL_SysCmd, -1 before the first
+    VERSION_REASON,  # what the last CTRL_Version gives reason to: NONE where it fits
+    LAST_VALID_NS,  # of CTRL_SysCmd; the three after it of the other messages in TIMED
+) = range(18)
+REJECTED_FOR = LAST_VALID_NS + len(TIMED)
+"""First of three slots: why the last frame of each watched message was rejected, NONE where it was not."""
 
-class DriveByWire:
-    """State machine of the vehicle. Feed it frames with `accept`, time with `at`; read `state`, `reason`, `gear`."""
+SLOTS = REJECTED_FOR + len(WATCHED)
 
-    def __init__(
-        self,
-        start_ns: int,
-        dbc_hash24: int,
-        vehicle_hash24: int,
-        timeouts_ns: Mapping[str, int],
-        gear_change_s: float,
-    ) -> None:
-        self.state = State.MANUAL
-        self.reason = Reason.NO_COMMAND
-        self.gear = Gear.PARK
-        self.park_brake_applied = True
-        self.driver_override_latched = False
-        self.steering_override = False
-        self.brake_override = False
-        self.emergency_stop_pressed = False
-        self.first_active_ns: int | None = None
-        self.control_leg = 0
-        self.next_event_ns = NEVER
-        """Next instant at which `at` must be called: the end of a gear change, or the earliest at which the watchdog
-        may bite; commands that come meanwhile only postpone it, so `at` then looks again."""
-        self._hashes = (PROTOCOL_VERSION, dbc_hash24, vehicle_hash24)
-        self._timeouts_ns = dict(timeouts_ns)
-        self._last_valid_ns: dict[str, int] = {}
-        self._start_ns = start_ns
-        self._active_since_ns = start_ns
-        self._gear_change_ns = round(gear_change_s * NS)
-        self._gear_wanted = Gear.PARK
-        self._gear_done_ns = NEVER
-        self._enable: int | None = None
-        self._operator_estop = 0
-        self._controller_version: tuple[int, int, int] | None = None
+Record = MutableSequence[int]
 
-    # -- what the emulator asks ---------------------------------------------------------------------------------------
 
-    @property
-    def follows_steering(self) -> bool:
-        """Steering keeps to valid commands while Active, and after a fault until the driver has the wheel."""
-        return self.state is State.ACTIVE or (self.state is State.FAULT and not self.driver_override_latched)
+class DriveByWire(NamedTuple):
+    """Constants of the system: timeouts in the order of TIMED, and what a change of gear takes."""
 
-    @property
-    def follows_speed(self) -> bool:
-        """Speed, brake, gear and park brake are the controller's only while Active."""
-        return self.state is State.ACTIVE
+    timeout_ns: tuple[int, int, int, int]
+    gear_change_ns: int
 
-    def may_drive(self, speed_mps: float) -> bool:
-        """Return whether gear and park brake let the car move with a speed command of this sign."""
-        if self.park_brake_applied:
-            return False
-        return (speed_mps > 0.0 and self.gear is Gear.DRIVE) or (speed_mps < 0.0 and self.gear is Gear.REVERSE)
 
-    def is_timed_out(self, name: str, now_ns: int) -> bool:
-        """Return whether no valid frame of the message has come for its timeout."""
-        return now_ns - self._last_valid_ns.get(name, -NEVER) >= self._timeouts_ns[name]
+def begin(start_ns: int) -> list[int]:
+    """Return the record of a parked car that has heard nothing."""
+    record = [0] * SLOTS
+    record[STATE], record[REASON] = MANUAL, NO_COMMAND
+    record[GEAR] = record[GEAR_WANTED] = PARK
+    record[PARK_BRAKE_APPLIED] = 1
+    record[FIRST_ACTIVE_NS] = record[NEXT_EVENT_NS] = record[GEAR_DONE_NS] = NEVER
+    record[ACTIVE_SINCE_NS] = start_ns
+    record[ENABLE] = -1
+    record[VERSION_REASON] = NO_COMMAND
+    for message in range(len(TIMED)):
+        record[LAST_VALID_NS + message] = -NEVER
+    return record
 
-    def _deadline_ns(self, name: str) -> int:
-        # A command that was silent before counts from the moment at which the vehicle became Active.
-        return max(self._last_valid_ns.get(name, 0), self._active_since_ns) + self._timeouts_ns[name]
 
-    def _schedule(self) -> None:
-        event_ns = self._gear_done_ns
-        if self.state is State.ACTIVE:
-            for name in WATCHED:
-                event_ns = min(event_ns, self._deadline_ns(name))
-        self.next_event_ns = event_ns
+# -- what the plant asks ----------------------------------------------------------------------------------------------
 
-    # -- what happens -------------------------------------------------------------------------------------------------
 
-    def at(self, now_ns: int, at_standstill: bool, receptions: Mapping[str, Any]) -> None:
-        """Let time pass to `now_ns`: watchdog, gear change, and the way from Manual to Ready.
+def follows_steering(w: Record) -> bool:
+    """Steering keeps to valid commands while Active, and after a fault until the driver has the wheel."""
+    return w[STATE] == ACTIVE or (w[STATE] == FAULT and w[OVERRIDE_LATCHED] == 0)
 
-        `receptions` (of the wire) tells whether a command that stays away was rejected.
-        """
-        if now_ns >= self._gear_done_ns:
-            self.gear = self._gear_wanted
-            self._gear_done_ns = NEVER
-        if now_ns >= self.next_event_ns:
-            if self.state is State.ACTIVE:
-                self._watch(now_ns, receptions)
-            self._schedule()
-        if self.state is State.MANUAL or self.state is State.READY:
-            self._judge_ready(now_ns, at_standstill)
 
-    def _watch(self, now_ns: int, receptions: Mapping[str, Any]) -> None:
-        for name in WATCHED:
-            if now_ns >= self._deadline_ns(name):
-                last = receptions[name]
-                if last.bad_crc:
-                    self._fault(Reason.BAD_CRC)
-                elif last.bad_counter:
-                    self._fault(Reason.BAD_COUNTER)
-                else:
-                    self._fault(Reason.COMMAND_TIMEOUT)
-                return
+def follows_speed(w: Record) -> bool:
+    """Speed, brake, gear and park brake are the controller's only while Active."""
+    return w[STATE] == ACTIVE
 
-    def _judge_ready(self, now_ns: int, at_standstill: bool) -> None:
-        version = self._controller_version
-        if self.is_timed_out("CTRL_SysCmd", now_ns) or version is None or self.is_timed_out("CTRL_Version", now_ns):
-            reason = Reason.NO_COMMAND
-        elif version[:2] != self._hashes[:2]:
-            reason = Reason.DBC_HASH_MISMATCH
-        elif version[2] != self._hashes[2]:
-            reason = Reason.VEHICLE_HASH_MISMATCH
-        elif self.state is State.MANUAL and not at_standstill:
-            reason = Reason.NOT_AT_STANDSTILL
-        elif self.state is State.MANUAL and self._enable == 1:
-            reason = Reason.ENABLE_HELD_AT_START
-        else:
-            if self.state is State.MANUAL:
-                self.state, self.reason = State.READY, Reason.NONE
+
+def may_drive(w: Record, speed_mps: float) -> bool:
+    """Return whether gear and park brake let the car move with a speed command of this sign."""
+    if w[PARK_BRAKE_APPLIED] != 0:
+        return False
+    return (speed_mps > 0.0 and w[GEAR] == DRIVE) or (speed_mps < 0.0 and w[GEAR] == REVERSE)
+
+
+def is_timed_out(p: DriveByWire, w: Record, message: int, now_ns: int) -> bool:
+    """Return whether no valid frame of the message (index in TIMED) has come for its timeout."""
+    return now_ns - w[LAST_VALID_NS + message] >= p.timeout_ns[message]
+
+
+def _deadline_ns(p: DriveByWire, w: Record, message: int) -> int:
+    # A command that was silent before counts from the moment at which the vehicle became Active.
+    return max(w[LAST_VALID_NS + message], w[ACTIVE_SINCE_NS]) + p.timeout_ns[message]
+
+
+def _schedule(p: DriveByWire, w: Record) -> None:
+    event_ns = w[GEAR_DONE_NS]
+    if w[STATE] == ACTIVE:
+        for message in range(3):
+            event_ns = min(event_ns, _deadline_ns(p, w, message))
+    w[NEXT_EVENT_NS] = event_ns
+
+
+# -- what happens -----------------------------------------------------------------------------------------------------
+
+
+def at(p: DriveByWire, w: Record, now_ns: int, at_standstill: bool) -> None:
+    """Let time pass to `now_ns`: watchdog, gear change, and the way from Manual to Ready."""
+    if now_ns >= w[GEAR_DONE_NS]:
+        w[GEAR] = w[GEAR_WANTED]
+        w[GEAR_DONE_NS] = NEVER
+    if now_ns >= w[NEXT_EVENT_NS]:
+        if w[STATE] == ACTIVE:
+            _watch(p, w, now_ns)
+        _schedule(p, w)
+    if w[STATE] == MANUAL or w[STATE] == READY:
+        _judge_ready(p, w, now_ns, at_standstill)
+
+
+def _watch(p: DriveByWire, w: Record, now_ns: int) -> None:
+    for message in range(3):
+        if now_ns >= _deadline_ns(p, w, message):
+            rejected_for = w[REJECTED_FOR + message]
+            fault(p, w, rejected_for if rejected_for != NO_REASON else COMMAND_TIMEOUT)
             return
-        self.state, self.reason = State.MANUAL, reason
 
-    def _fault(self, reason: Reason) -> None:
-        if self.state is not State.FAULT:
-            self.state, self.reason = State.FAULT, reason
-            self._schedule()
 
-    def accept(self, now_ns: int, name: str, values: Mapping[str, float], at_standstill: bool) -> None:
-        """Take a valid frame of controller or operator; `at` must have been called for `now_ns` before."""
-        self._last_valid_ns[name] = now_ns
-        if name == "CTRL_SysCmd":
-            self.control_leg = int(values["control_leg"])
-            self._requests(now_ns, int(values["enable_request"]), int(values["clear_request"]), at_standstill)
-        elif name == "CTRL_Version":
-            self._controller_version = (
-                int(values["ctrl_protocol"]),
-                int(values["ctrl_dbc_hash"]),
-                int(values["ctrl_vehicle_hash"]),
-            )
-        elif name == "OPER_Cmd":
-            self._operator_estop = int(values["oper_estop"])
-            if self._operator_estop:
-                self._fault(Reason.EMERGENCY_STOP)
+def _judge_ready(p: DriveByWire, w: Record, now_ns: int, at_standstill: bool) -> None:
+    if is_timed_out(p, w, SYS, now_ns) or is_timed_out(p, w, VERSION, now_ns):
+        reason = NO_COMMAND
+    elif w[VERSION_REASON] != NO_REASON:
+        reason = w[VERSION_REASON]
+    elif w[STATE] == MANUAL and not at_standstill:
+        reason = NOT_AT_STANDSTILL
+    elif w[STATE] == MANUAL and w[ENABLE] == 1:
+        reason = ENABLE_HELD_AT_START
+    else:
+        if w[STATE] == MANUAL:
+            w[STATE] = READY
+            w[REASON] = NO_REASON
+        return
+    w[STATE] = MANUAL
+    w[REASON] = reason
 
-    def _requests(self, now_ns: int, enable: int, clear: int, at_standstill: bool) -> None:
-        rising = enable == 1 and self._enable == 0
-        self._enable = enable
-        if self.state is State.ACTIVE and not enable:
-            self.state, self.reason = State.READY, Reason.DISABLED_BY_CONTROLLER
-        elif self.state is State.FAULT and clear and not enable and at_standstill and not self._cause_lasts():
-            self.driver_override_latched = False
-            self.state, self.reason = State.MANUAL, Reason.NO_COMMAND
-            self._judge_ready(now_ns, at_standstill)
-        elif self.state is State.READY and rising:
-            if at_standstill:
-                self.state, self.reason = State.ACTIVE, Reason.NONE
-                self._active_since_ns = now_ns
-                if self.first_active_ns is None:
-                    self.first_active_ns = now_ns
-                self._schedule()
-            else:
-                self.reason = Reason.NOT_AT_STANDSTILL
 
-    def _cause_lasts(self) -> bool:
-        pressed = self._operator_estop or self.emergency_stop_pressed
-        return bool(pressed or self.steering_override or self.brake_override)
+def fault(p: DriveByWire, w: Record, reason: int) -> None:
+    """Become Fault for a reason; the first reason stays."""
+    if w[STATE] != FAULT:
+        w[STATE] = FAULT
+        w[REASON] = reason
+        _schedule(p, w)
 
-    def follow_gear(self, now_ns: int, gear_cmd: int, park_brake_cmd: int, at_standstill: bool) -> None:
-        """Obey gear and park-brake command; the gear only at standstill, and it takes its time."""
-        if not park_brake_cmd:
-            self.park_brake_applied = False
-        elif at_standstill:
-            self.park_brake_applied = True
-        if self._gear_done_ns != NEVER or not at_standstill or not Gear.PARK <= gear_cmd <= Gear.DRIVE:
-            return
-        if gear_cmd != self.gear:
-            self._gear_wanted = Gear(gear_cmd)
-            self.gear = Gear.NONE
-            self._gear_done_ns = now_ns + self._gear_change_ns
-            self._schedule()
 
-    def driver(self, control: str, active: bool) -> None:
-        """Let the driver take the hand wheel ("steering") or a pedal ("brake"), or let go of it."""
-        if control == "steering":
-            self.steering_override = active
+def accept(w: Record, message: int, now_ns: int) -> None:
+    """Note a valid frame of a message (index in TIMED); `at` must have been called for `now_ns` before."""
+    w[LAST_VALID_NS + message] = now_ns
+
+
+def accept_requests(p: DriveByWire, w: Record, now_ns: int, enable: int, clear: int, at_standstill: bool) -> None:
+    """Take the requests of a valid CTRL_SysCmd."""
+    w[LAST_VALID_NS] = now_ns
+    rising = enable == 1 and w[ENABLE] == 0
+    w[ENABLE] = enable
+    if w[STATE] == ACTIVE and enable == 0:
+        w[STATE] = READY
+        w[REASON] = DISABLED_BY_CONTROLLER
+    elif w[STATE] == FAULT and clear != 0 and enable == 0 and at_standstill and not _cause_lasts(w):
+        w[OVERRIDE_LATCHED] = 0
+        w[STATE] = MANUAL
+        w[REASON] = NO_COMMAND
+        _judge_ready(p, w, now_ns, at_standstill)
+    elif w[STATE] == READY and rising:
+        if at_standstill:
+            w[STATE] = ACTIVE
+            w[REASON] = NO_REASON
+            w[ACTIVE_SINCE_NS] = now_ns
+            w[FIRST_ACTIVE_NS] = min(w[FIRST_ACTIVE_NS], now_ns)
+            _schedule(p, w)
         else:
-            self.brake_override = active
-        if active:
-            self.driver_override_latched = True
-            self._fault(Reason.DRIVER_OVERRIDE)
+            w[REASON] = NOT_AT_STANDSTILL
 
-    def press_emergency_stop(self, pressed: bool) -> None:
-        """Press or release the emergency-stop button in the car."""
-        self.emergency_stop_pressed = pressed
-        if pressed:
-            self._fault(Reason.EMERGENCY_STOP)
+
+def accept_operator(p: DriveByWire, w: Record, estop: int) -> None:
+    """Take a valid OPER_Cmd."""
+    w[OPERATOR_ESTOP] = estop
+    if estop != 0:
+        fault(p, w, EMERGENCY_STOP)
+
+
+def _cause_lasts(w: Record) -> bool:
+    return w[OPERATOR_ESTOP] != 0 or w[BUTTON_PRESSED] != 0 or w[STEERING_OVERRIDE] != 0 or w[BRAKE_OVERRIDE] != 0
+
+
+def follow_gear(p: DriveByWire, w: Record, now_ns: int, gear: int, park_brake: int, at_standstill: bool) -> None:
+    """Obey gear and park-brake command; the gear only at standstill, and it takes its time."""
+    if park_brake == 0:
+        w[PARK_BRAKE_APPLIED] = 0
+    elif at_standstill:
+        w[PARK_BRAKE_APPLIED] = 1
+    if w[GEAR_DONE_NS] != NEVER or not at_standstill or gear < PARK or gear > DRIVE:
+        return
+    if gear != w[GEAR]:
+        w[GEAR_WANTED] = gear
+        w[GEAR] = NO_GEAR
+        w[GEAR_DONE_NS] = now_ns + p.gear_change_ns
+        _schedule(p, w)
+
+
+def driver(p: DriveByWire, w: Record, control: int, active: int) -> None:
+    """Let the driver take the hand wheel (STEERING_OVERRIDE) or a pedal (BRAKE_OVERRIDE), or let go of it."""
+    w[control] = active
+    if active != 0:
+        w[OVERRIDE_LATCHED] = 1
+        fault(p, w, DRIVER_OVERRIDE)
+
+
+def press_emergency_stop(p: DriveByWire, w: Record, pressed: int) -> None:
+    """Press or release the emergency-stop button in the car."""
+    w[BUTTON_PRESSED] = pressed
+    if pressed != 0:
+        fault(p, w, EMERGENCY_STOP)

@@ -93,8 +93,12 @@ def state_at_rest(p: PlantParameters, x_m: float, y_m: float, yaw_rad: float) ->
 
 def rear_axle_pose(p: PlantParameters, state: PlantState) -> tuple[float, float, float]:
     """Pose (x, y in m, yaw in rad) of the rear-axle centre."""
-    yaw = state.yaw_rad
-    return state.x_m - p.cg_to_rear_axle_m * cos(yaw), state.y_m - p.cg_to_rear_axle_m * sin(yaw), yaw
+    return rear_axle_of(p, state.x_m, state.y_m, state.yaw_rad)
+
+
+def rear_axle_of(p: PlantParameters, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float, float]:
+    """Pose of the rear-axle centre, from that of the centre of gravity (m, m, rad)."""
+    return x_m - p.cg_to_rear_axle_m * cos(yaw_rad), y_m - p.cg_to_rear_axle_m * sin(yaw_rad), yaw_rad
 
 
 def step(p: PlantParameters, s: PlantState, speed_next: float, road_wheel_angle: float, h: float) -> PlantState:

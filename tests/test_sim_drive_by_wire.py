@@ -146,11 +146,11 @@ def test_the_watchdog_bites_100_ms_after_the_last_command_and_stops_the_car(lost
     bench.emulator.advance(last_ns + 100 * MS)
     assert bench.emulator.state is FAULT
     assert bench.emulator.reason is Reason.COMMAND_TIMEOUT
-    at_bite = bench.emulator._state.x_m  # the instant lies between two reports
+    at_bite = bench.emulator._motion.body.x_m  # the instant lies between two reports
     bench.now_ns += 10 * TICK
     bench.tick(150)
     assert bench.truth.speed_mps == 0.0
-    way = bench.emulator._state.x_m - at_bite
+    way = bench.emulator._motion.body.x_m - at_bite
     assert way == pytest.approx(0.8 * 0.1 + 0.8**2 / (2 * BRAKE_DECEL_MPS2), abs=0.015)
     assert bench.state == (FAULT, Reason.COMMAND_TIMEOUT)
     assert bench.emulator.is_safe

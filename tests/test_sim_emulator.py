@@ -23,7 +23,7 @@ def driving(world: Any = None, speed: float = 0.5, **keys: Any) -> Bench:
 
 def rack(bench: Bench) -> float:
     """The rack's angle at the emulator's present instant, which may lie between reports."""
-    return bench.emulator._steer.rack_rad
+    return bench.emulator._motion.steer.rack_rad
 
 
 # ----------------------------------------------------------------------------------------------------------- latency
@@ -64,9 +64,9 @@ def test_speed_and_brake_have_a_dead_time_of_their_own() -> None:
         bench.send(arrival_ns, "CTRL_LongCmd", {**bench.long, "brake_decel_cmd_mps2": 2.0})
         acts_ns = arrival_ns + round(samples * TICK)
         bench.emulator.advance(acts_ns)
-        assert bench.emulator._decel_mps2 == 0.0
+        assert bench.emulator._motion.decel_mps2 == 0.0
         bench.emulator.advance(acts_ns + MS)
-        assert bench.emulator._decel_mps2 == pytest.approx(2.0 * (1.0 - math.exp(-0.01)))
+        assert bench.emulator._motion.decel_mps2 == pytest.approx(2.0 * (1.0 - math.exp(-0.01)))
 
 
 @pytest.mark.parametrize("samples", [0.0, 1.0, 1.25, 3.0])
@@ -277,25 +277,25 @@ def test_time_that_is_gone_is_gone() -> None:
     """A frame with an instant in the past acts now; an advance into the past does nothing."""
     bench = driving()
     now_ns = bench.emulator.now_ns
-    state = bench.emulator._state
+    state = bench.emulator._motion.body
     bench.emulator.advance(now_ns - 5 * MS)
-    assert (bench.emulator.now_ns, bench.emulator._state) == (now_ns, state)
+    assert (bench.emulator.now_ns, bench.emulator._motion.body) == (now_ns, state)
     bench.send(now_ns - 5 * MS, "CTRL_SteerCmd", {"road_wheel_angle_cmd_rad": 0.3, "steer_enable": 1})
     bench.emulator.advance(now_ns + MS)
     assert rack(bench) == pytest.approx(0.59e-3)
 
 
 def test_no_step_is_longer_than_a_millisecond(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sim.emulator  # noqa: PLC0415
+    import sim.plant  # noqa: PLC0415
 
     steps: list[float] = []
-    original = sim.emulator.step
+    original = sim.plant.step
 
     def watched(*args: Any) -> Any:
         steps.append(args[-1])
         return original(*args)
 
-    monkeypatch.setattr(sim.emulator, "step", watched)
+    monkeypatch.setattr(sim.plant, "step", watched)
     bench = driving(period_ns=13_700_003)
     assert max(steps) <= 1e-3
     assert sum(steps) == pytest.approx(1e-9 * bench.emulator.now_ns, rel=1e-6)

@@ -1,0 +1,395 @@
+"""The plant of one run: what acts when, the body's motion, and what the sensors see of it.
+
+The emulator, the campaign and the comparison all drive by these functions. They are written on floats, NamedTuples
+and records (mutable rows of numbers: lists in the live emulator, arrays when compiled), with `math` only, so that the
+same source runs in CPython and through numba with the same bits.
+
+Timing. An accepted command acts `steer_latency_ns` or `long_latency_ns` after it arrived, to the nanosecond; the
+motion is integrated in steps of at most 1 ms that end at every instant at which something acts.
+"""
+
+import random
+from collections.abc import MutableSequence
+from typing import NamedTuple
+
+from sim import drive_by_wire as dbw
+from sim.actuators import SteeringParameters, SteeringState, steering_target, step_speed, step_steering
+from sim.data_files import Course, Scenario, Side, Vehicle, check_fit, true_vehicle
+from sim.sensors import SensorParameters, parameters_of
+from sim.vehicle import PlantParameters, PlantState, plant_parameters, rear_axle_of, state_at_rest, step
+
+PERIOD_NS = 10_000_000
+"""Cycle of the fast reports, and the length of a sample in the vehicle file."""
+
+MAX_STEP_NS = 1_000_000
+
+HISTORY = 2048
+"""Steps that are remembered: the longest pose latency is 40 samples, so 400 steps and some that were cut short."""
+
+PENDING = 512
+"""Commands that may be on their way: the longest dead time is 100 samples."""
+
+_ROUNDING_RAD = 1.0e-9
+_MISSED_TARGET_RAD = 1.0e-4  # farther than this from its target when the next one comes: the rate limit has cut it
+
+# Slots of the record of targets and commands.
+(
+    STEER_TARGET_RAD,
+    SPEED_TARGET_MPS,
+    DECEL_TARGET_MPS2,
+    SPEED_CMD_MPS,  # of the command that acts
+    DECEL_CMD_MPS2,
+    ECHO_ANGLE_RAD,  # of the command that arrived last
+    ECHO_SPEED_MPS,
+    ECHO_DECEL_MPS2,
+) = range(8)
+TARGET_SLOTS = 8
+
+# Slots of the record of flags and places.
+(
+    LONG_ENABLE,  # of the command that acts
+    GEAR_CMD,
+    PARK_BRAKE_CMD,
+    LIMITED_VALUE,
+    LIMITED_RATE,
+    IS_FROZEN,  # a fault holds the rack
+    STEER_FIRST,  # place of the oldest pending command, and how many there are
+    STEER_COUNT,
+    LONG_FIRST,
+    LONG_COUNT,
+    PAST_FIRST,
+    PAST_COUNT,
+) = range(12)
+FLAG_SLOTS = 12
+
+Floats = MutableSequence[float]
+Ints = MutableSequence[int]
+
+
+class Car(NamedTuple):
+    """Constants of one run: the true car, with its latencies in ns."""
+
+    body: PlantParameters
+    steering: SteeringParameters
+    system: dbw.DriveByWire
+    steer_latency_ns: int
+    long_latency_ns: int
+    pose_latency_ns: int
+    drive_lag_s: float
+    brake_lag_s: float
+    max_decel_mps2: float
+
+
+class Motion(NamedTuple):
+    """Where the car is at `t_ns`, with its actuators; accelerations and rates are those of the last step."""
+
+    t_ns: int
+    body: PlantState
+    steer: SteeringState
+    decel_mps2: float
+    accel_x_mps2: float
+    wheel_rate_radps: float
+
+
+class Memory(NamedTuple):
+    """Records: the drive-by-wire system, targets and flags, commands on their way, and the recent past of the body.
+
+    The past is the pose of the centre of gravity (m, m, rad) at the end of each step.
+    """
+
+    system: Ints
+    target: Floats
+    flag: Ints
+    steer_due_ns: Ints
+    steer_rad: Floats
+    long_due_ns: Ints
+    long_speed_mps: Floats
+    long_decel_mps2: Floats
+    long_gear: Ints
+    long_park_brake: Ints
+    long_enable: Ints
+    past_ns: Ints
+    past_x_m: Floats
+    past_y_m: Floats
+    past_yaw_rad: Floats
+
+
+class Setup(NamedTuple):
+    """What a run starts from: the true car, its sensors, and the pose of its rear-axle centre (m, m, rad)."""
+
+    car: Car
+    sensors: SensorParameters
+    start: tuple[float, float, float]
+
+
+def set_up(
+    vehicle: Vehicle, course: Course, scenario: Scenario, side: Side, seed: int, timeout_ns: tuple[int, int, int, int]
+) -> Setup:
+    """Draw the true car, its sensors and its start; `timeout_ns` are those of the messages in `drive_by_wire.TIMED`.
+
+    Raises UserError where the car does not fit the course.
+    """
+    nominal = vehicle.with_overlay(scenario.vehicle_overlay, f"scenario {scenario.name}: vehicle_overlay.")
+    check_fit(nominal, course)
+    rng = random.Random(f"plant {seed}")
+    true = true_vehicle(nominal, scenario, seed, rng)
+    plant = scenario.plant
+    steering = SteeringParameters(
+        max_angle_rad=true.max_road_wheel_angle_rad,
+        max_rate_radps=true.max_road_wheel_rate_radps,
+        lag_s=true.steering_lag_s,
+        gain=rng.uniform(*plant.steering_gain),
+        bias_rad=rng.uniform(*plant.steering_bias_rad),
+        half_backlash_rad=0.5 * rng.uniform(*plant.steering_backlash_rad),
+        resolution_rad=rng.uniform(*plant.steering_command_resolution_rad),
+    )
+    car = Car(
+        body=plant_parameters(
+            true.mass_kg,
+            true.yaw_inertia_kgm2,
+            true.wheelbase_m,
+            true.cg_to_rear_axle_m,
+            true.cornering_stiffness_front_n_per_rad,
+            true.cornering_stiffness_rear_n_per_rad,
+            true.tyre_friction,
+            true.relaxation_length_m,
+        ),
+        steering=steering,
+        system=dbw.DriveByWire(timeout_ns, round(true.gear_change_s * dbw.NS)),
+        steer_latency_ns=round(true.command_latency_samples * PERIOD_NS),
+        long_latency_ns=round(rng.uniform(*plant.longitudinal_latency_samples) * PERIOD_NS),
+        pose_latency_ns=round(true.pose_latency_samples * PERIOD_NS),
+        drive_lag_s=true.drive_lag_s,
+        brake_lag_s=true.brake_lag_s,
+        max_decel_mps2=true.max_decel_mps2,
+    )
+    start = scenario.start.apply(course.start_pose(nominal, side), rng)
+    return Setup(car, parameters_of(scenario.sensors, seed), (start.x_m, start.y_m, start.yaw_rad))
+
+
+def begin_memory(start_ns: int) -> Memory:
+    """Return the records of a parked car, as lists; `begin` puts the body's past into them."""
+    return Memory(
+        system=dbw.begin(start_ns),
+        target=[0.0] * TARGET_SLOTS,
+        flag=[0] * FLAG_SLOTS,
+        steer_due_ns=[0] * PENDING,
+        steer_rad=[0.0] * PENDING,
+        long_due_ns=[0] * PENDING,
+        long_speed_mps=[0.0] * PENDING,
+        long_decel_mps2=[0.0] * PENDING,
+        long_gear=[0] * PENDING,
+        long_park_brake=[0] * PENDING,
+        long_enable=[0] * PENDING,
+        past_ns=[0] * HISTORY,
+        past_x_m=[0.0] * HISTORY,
+        past_y_m=[0.0] * HISTORY,
+        past_yaw_rad=[0.0] * HISTORY,
+    )
+
+
+def begin(car: Car, m: Memory, start: tuple[float, float, float], start_ns: int) -> Motion:
+    """Return the motion of a car that stands at the start, braked, with its wheels straight."""
+    x, y, yaw = start
+    body = state_at_rest(car.body, x, y, yaw)
+    m.target[DECEL_TARGET_MPS2] = dbw.BRAKE_DECEL_MPS2
+    _remember(m, start_ns, body)
+    return Motion(start_ns, body, SteeringState(0.0, 0.0, 0.0), dbw.BRAKE_DECEL_MPS2, 0.0, 0.0)
+
+
+# -- time -------------------------------------------------------------------------------------------------------------
+
+
+def advance(car: Car, motion: Motion, m: Memory, now_ns: int, stop_ns: int) -> Motion:
+    """Return the motion at `now_ns`, stopping at every instant at which something acts; earlier is no effect.
+
+    What acts from outside at `stop_ns` comes before all else: having reached it, this returns without acting there.
+    """
+    while True:
+        event_ns = min(_next_event_ns(m), stop_ns)
+        until_ns = min(event_ns, now_ns)
+        if until_ns > motion.t_ns:
+            motion = integrate(car, motion, m, until_ns)
+        if event_ns > now_ns or event_ns == stop_ns:
+            return motion
+        act(car, motion, m)
+
+
+def _next_event_ns(m: Memory) -> int:
+    event_ns = m.system[dbw.NEXT_EVENT_NS]
+    if m.flag[STEER_COUNT] != 0:
+        event_ns = min(event_ns, m.steer_due_ns[m.flag[STEER_FIRST]])
+    if m.flag[LONG_COUNT] != 0:
+        event_ns = min(event_ns, m.long_due_ns[m.flag[LONG_FIRST]])
+    return event_ns
+
+
+def act(car: Car, motion: Motion, m: Memory) -> None:
+    """Let all that is due at the present instant act."""
+    now_ns = motion.t_ns
+    flag = m.flag
+    dbw.at(car.system, m.system, now_ns, motion.body.speed_mps == 0.0)
+    while flag[STEER_COUNT] != 0 and m.steer_due_ns[flag[STEER_FIRST]] <= now_ns:
+        angle = m.steer_rad[flag[STEER_FIRST]]
+        flag[STEER_FIRST] = (flag[STEER_FIRST] + 1) % PENDING
+        flag[STEER_COUNT] -= 1
+        if dbw.follows_steering(m.system):
+            missed = abs(m.target[STEER_TARGET_RAD] - motion.steer.demand_rad) > _MISSED_TARGET_RAD
+            flag[LIMITED_RATE] = 1 if missed else 0
+            flag[LIMITED_VALUE] = 1 if abs(angle) > car.steering.max_angle_rad + _ROUNDING_RAD else 0
+            m.target[STEER_TARGET_RAD] = steering_target(car.steering, angle)
+    while flag[LONG_COUNT] != 0 and m.long_due_ns[flag[LONG_FIRST]] <= now_ns:
+        place = flag[LONG_FIRST]
+        flag[LONG_FIRST] = (place + 1) % PENDING
+        flag[LONG_COUNT] -= 1
+        m.target[SPEED_CMD_MPS] = m.long_speed_mps[place]
+        m.target[DECEL_CMD_MPS2] = m.long_decel_mps2[place]
+        flag[GEAR_CMD] = m.long_gear[place]
+        flag[PARK_BRAKE_CMD] = m.long_park_brake[place]
+        flag[LONG_ENABLE] = m.long_enable[place]
+    apply_targets(car, motion, m)
+
+
+def apply_targets(car: Car, motion: Motion, m: Memory) -> None:
+    """Set what drive and brake are to do, from the command that acts and the state of the vehicle."""
+    target = m.target
+    flag = m.flag
+    if not dbw.follows_speed(m.system) or flag[LONG_ENABLE] == 0:
+        target[SPEED_TARGET_MPS] = 0.0
+        target[DECEL_TARGET_MPS2] = dbw.BRAKE_DECEL_MPS2
+        return
+    standing = motion.body.speed_mps == 0.0
+    dbw.follow_gear(car.system, m.system, motion.t_ns, flag[GEAR_CMD], flag[PARK_BRAKE_CMD], standing)
+    speed = target[SPEED_CMD_MPS]
+    if not dbw.may_drive(m.system, speed):
+        speed = 0.0
+    target[SPEED_TARGET_MPS] = speed
+    target[DECEL_TARGET_MPS2] = min(target[DECEL_CMD_MPS2], car.max_decel_mps2)
+
+
+def integrate(car: Car, motion: Motion, m: Memory, until_ns: int) -> Motion:
+    """Return the motion at `until_ns`, later than now, with the targets as they are."""
+    t_ns = motion.t_ns
+    body = motion.body
+    steer = motion.steer
+    decel = motion.decel_mps2
+    span_ns = until_ns - t_ns
+    count = -(-span_ns // MAX_STEP_NS)
+    h = span_ns * 1.0e-9 / count
+    is_frozen = m.flag[IS_FROZEN] != 0
+    target = m.target[STEER_TARGET_RAD]
+    speed_target = m.target[SPEED_TARGET_MPS]
+    decel_target = m.target[DECEL_TARGET_MPS2]
+    drive_lag = car.drive_lag_s
+    brake_lag = car.brake_lag_s
+    bias = car.steering.bias_rad
+    speed = body.speed_mps
+    before = speed
+    wheel_before = steer.wheel_rad
+    for index in range(1, count + 1):
+        wheel_before = steer.wheel_rad
+        if not is_frozen:
+            steer = step_steering(car.steering, steer, target, h)
+        before = speed
+        speed, decel = step_speed(drive_lag, brake_lag, speed, decel, speed_target, decel_target, h)
+        body = step(car.body, body, speed, steer.wheel_rad + bias, h)
+        _remember(m, t_ns + span_ns * index // count, body)
+    return Motion(until_ns, body, steer, decel, (speed - before) / h, (steer.wheel_rad - wheel_before) / h)
+
+
+def _remember(m: Memory, t_ns: int, body: PlantState) -> None:
+    flag = m.flag
+    place = (flag[PAST_FIRST] + flag[PAST_COUNT]) % HISTORY
+    if flag[PAST_COUNT] == HISTORY:
+        flag[PAST_FIRST] = (flag[PAST_FIRST] + 1) % HISTORY
+    else:
+        flag[PAST_COUNT] += 1
+    m.past_ns[place] = t_ns
+    m.past_x_m[place] = body.x_m
+    m.past_y_m[place] = body.y_m
+    m.past_yaw_rad[place] = body.yaw_rad
+
+
+def pose_at(car: Car, m: Memory, t_ns: int) -> tuple[float, float, float]:
+    """Rear-axle pose at an earlier instant, between two steps by linear interpolation; forgets what is older."""
+    flag = m.flag
+    while flag[PAST_COUNT] > 1 and m.past_ns[(flag[PAST_FIRST] + 1) % HISTORY] <= t_ns:
+        flag[PAST_FIRST] = (flag[PAST_FIRST] + 1) % HISTORY
+        flag[PAST_COUNT] -= 1
+    first = flag[PAST_FIRST]
+    x = m.past_x_m[first]
+    y = m.past_y_m[first]
+    yaw = m.past_yaw_rad[first]
+    if m.past_ns[first] < t_ns and flag[PAST_COUNT] > 1:
+        later = (first + 1) % HISTORY
+        share = (t_ns - m.past_ns[first]) / (m.past_ns[later] - m.past_ns[first])
+        x += share * (m.past_x_m[later] - x)
+        y += share * (m.past_y_m[later] - y)
+        yaw += share * (m.past_yaw_rad[later] - yaw)
+    return rear_axle_of(car.body, x, y, yaw)
+
+
+# -- commands in ------------------------------------------------------------------------------------------------------
+
+
+def accept_steer(car: Car, motion: Motion, m: Memory, angle_rad: float, enable: int) -> None:
+    """Take a valid CTRL_SteerCmd that arrives at the present instant."""
+    dbw.accept(m.system, dbw.STEER, motion.t_ns)
+    m.target[ECHO_ANGLE_RAD] = angle_rad
+    if enable != 0:
+        flag = m.flag
+        place = (flag[STEER_FIRST] + flag[STEER_COUNT]) % PENDING
+        if flag[STEER_COUNT] == PENDING:
+            flag[STEER_FIRST] = (flag[STEER_FIRST] + 1) % PENDING
+        else:
+            flag[STEER_COUNT] += 1
+        m.steer_due_ns[place] = motion.t_ns + car.steer_latency_ns
+        m.steer_rad[place] = angle_rad
+        if car.steer_latency_ns == 0:
+            act(car, motion, m)
+
+
+def accept_long(
+    car: Car,
+    motion: Motion,
+    m: Memory,
+    speed_mps: float,
+    decel_mps2: float,
+    gear: int,
+    park_brake: int,
+    enable: int,
+) -> None:
+    """Take a valid CTRL_LongCmd that arrives at the present instant."""
+    dbw.accept(m.system, dbw.LONG, motion.t_ns)
+    m.target[ECHO_SPEED_MPS] = speed_mps
+    m.target[ECHO_DECEL_MPS2] = decel_mps2
+    flag = m.flag
+    place = (flag[LONG_FIRST] + flag[LONG_COUNT]) % PENDING
+    if flag[LONG_COUNT] == PENDING:
+        flag[LONG_FIRST] = (flag[LONG_FIRST] + 1) % PENDING
+    else:
+        flag[LONG_COUNT] += 1
+    m.long_due_ns[place] = motion.t_ns + car.long_latency_ns
+    m.long_speed_mps[place] = speed_mps
+    m.long_decel_mps2[place] = decel_mps2
+    m.long_gear[place] = gear
+    m.long_park_brake[place] = park_brake
+    m.long_enable[place] = enable
+    if car.long_latency_ns == 0:
+        act(car, motion, m)
+
+
+def accept_sys(car: Car, motion: Motion, m: Memory, enable: int, clear: int, leg: int) -> None:
+    """Take a valid CTRL_SysCmd that arrives at the present instant."""
+    m.system[dbw.CONTROL_LEG] = leg
+    before = m.system[dbw.STATE]
+    dbw.accept_requests(car.system, m.system, motion.t_ns, enable, clear, motion.body.speed_mps == 0.0)
+    if m.system[dbw.STATE] != before:
+        note_new_state(car, motion, m)
+
+
+def note_new_state(car: Car, motion: Motion, m: Memory) -> None:
+    """Let a new state of the drive-by-wire system act."""
+    if m.system[dbw.STATE] == dbw.ACTIVE and dbw.is_timed_out(car.system, m.system, dbw.LONG, motion.t_ns):
+        m.flag[LONG_ENABLE] = 0  # a command from long ago must not move the car
+    apply_targets(car, motion, m)
