@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-vcan quick live design wheel clean
+.PHONY: help install demo test test-vcan quick live soak soak-loopbus soak-vcan0 design wheel clean
 
 VENV := .venv
 STAMP := $(VENV)/.installed
@@ -14,6 +14,7 @@ help:
 	@echo "make demo     the car takes the test by itself, forward and in reverse (about 40 s); more: .venv/bin/parkctl demo --help"
 	@echo "make test     lint, format, types, all tests"
 	@echo "make test-vcan  only those on a real vcan0, in a guest kernel (2 min; once before: .venv/bin/parkctl guest --install)"
+	@echo "make soak     18 tests in a row on loopbus, then on vcan0, cyclictest beside them (20 min; SOAK_RUNS=2 for a look)"
 	@echo "make design   makes the shipped tables anew from the vehicle and course files"
 	@echo "make wheel    builds dist/parkctl_controller-*.whl, the controller alone, for the car"
 	@echo "make install  .venv with everything in it (demo and test do this by themselves)"
@@ -65,6 +66,16 @@ live: $(STAMP)
 # Part of `live` too, where the guest is installed.
 test-vcan: $(STAMP)
 	$(BIN)/pytest tests/test_vcan_live.py tests/test_vcan_mistakes.py
+
+SOAK_RUNS ?= 18
+soak: soak-loopbus soak-vcan0
+
+soak-loopbus: $(STAMP)
+	@mkdir -p runs
+	$(BIN)/parkctl soak --runs $(SOAK_RUNS) --json runs/soak_loopbus.json
+
+soak-vcan0: $(STAMP)
+	$(BIN)/parkctl guest -- parkctl soak --runs $(SOAK_RUNS) -i socketcan -c vcan0 --json runs/soak_vcan0.json
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks *.egg-info

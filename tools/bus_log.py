@@ -15,7 +15,19 @@ Frame = tuple[float, int, bytes, bool]
 """Unix time in s, arbitration id, data, is error frame."""
 
 
-class BusLog:
+class NoLog:
+    """In the place of a log where none is kept."""
+
+    failed: str | None = None
+
+    def add(self, frames: list[Frame]) -> None:
+        """Forget them."""
+
+    def write_due(self, now_s: float) -> None:
+        """Write nothing."""
+
+
+class BusLog(NoLog):
     """Writes frames to a file; `write_due` is cheap and may be called often.
 
     A full disk must not stop a car: what goes wrong in writing ends the log and is kept in `failed`.
@@ -27,7 +39,6 @@ class BusLog:
         self._held: list[Frame] = []
         self._next_write_s = 0.0
         self._last_s = 0.0
-        self.failed: str | None = None
 
     def add(self, frames: list[Frame]) -> None:
         """Take frames in."""

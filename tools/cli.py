@@ -23,6 +23,7 @@ COMMANDS = {
         "what goes into the car: the wheel of the controller alone, with its systemd units",
     ),
     "bench": ("tools.bench.command", "what the controller costs: jitter, tick, codec, turnaround, beside their floors"),
+    "soak": ("tools.bench.soak", "many tests in a row with the same processes: frames, faults, memory, late cycles"),
     "guest": ("tools.guest.command", "run a command where a real vcan0 is, on any Linux on x86-64, without root"),
 }
 """Subcommand: (module with add_arguments(parser) and run(args) -> exit status, what it is for)."""
@@ -34,7 +35,7 @@ PROCESSES = {
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "deploy", "bench", "guest")
+ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "deploy", "bench", "soak", "guest")
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2

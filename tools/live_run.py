@@ -16,7 +16,7 @@ import numpy as np
 
 from firmware_py.reasons import TEXT
 from sim.errors import UserError
-from tools.bus_log import BusLog
+from tools.bus_log import NoLog
 from tools.figures import PathTable, project
 from tools.operator_station import ACTIVE, COMPLETE, FAULT, MANUAL, NO_REASON, Station, exchange
 from tools.processes import STATUS_USER_ERROR, Child
@@ -58,7 +58,7 @@ class LiveRun:
         *,
         bus: can.BusABC,
         station: Station,
-        log: BusLog,
+        log: NoLog,
         progress: Progress,
         path: PathTable,
         realtime: str | None,

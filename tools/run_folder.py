@@ -15,7 +15,7 @@ MARK = "run.json"
 """Written first; a folder with this file belongs to an earlier run and may be used again."""
 CONTENT = (
     MARK, "figures.json", "bus.log", "truth.csv", "exam.json", "controller.txt", "emulator.txt",
-    "flight_record.csv", "swept_body.png", "signals.png", "tables",
+    "flight_record.csv", "swept_body.png", "signals.png", "tables", "soak.json",
 )  # fmt: skip
 
 

@@ -62,12 +62,13 @@ def start_controller(sys_cmd_id: int) -> Started:
                     break
             startup_s = time.perf_counter() - begun
             time.sleep(SETTLED_S)
-            return Started(startup_s, _rss_mib(child.process.pid))
+            return Started(startup_s, rss_mib(child.process.pid))
         finally:
             child.close()
 
 
-def _rss_mib(pid: int) -> float:
+def rss_mib(pid: int) -> float:
+    """Return the resident memory of a process. Raises UserError where it has none: it has ended."""
     for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024.0
