@@ -40,7 +40,7 @@ MEMORY_MIB = 0.5
 EXIT_PASSED, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 130
 
 
-class Test(NamedTuple):
+class Drive(NamedTuple):
     """One test of the soak, as the processes report it at its end; counts are of this test alone."""
 
     number: int
@@ -167,7 +167,7 @@ class SoakRun(LiveRun):
     def __init__(self, runs: int, **parts: Any) -> None:
         super().__init__(**parts)
         self._runs = runs
-        self.tests: list[Test] = []
+        self.tests: list[Drive] = []
         self.faults = 0
         self.vehicle: dict[str, Any] = {}
         """The emulator's newest report."""
@@ -200,7 +200,7 @@ class SoakRun(LiveRun):
                     return f"test {len(self.tests) + 1}: the car did not start: {station.reason_text}"
             elif station.mode == MANUAL and station.reason == COMPLETE:
                 said = self._controller.latest
-                test = Test(
+                test = Drive(
                     number=len(self.tests) + 1,
                     duration_s=now_s - began_s,
                     late_cycles=said.get("late_cycles", 0) - late,
@@ -219,7 +219,7 @@ class SoakRun(LiveRun):
         return None
 
 
-def _line_of(test: Test, runs: int) -> str:
+def _line_of(test: Drive, runs: int) -> str:
     return (
         f"test {test.number:2d} of {runs}: {test.duration_s:.1f} s, {test.late_cycles} late cycles, "
         f"{test.overruns} skipped, controller {test.rss_mib:.2f} MiB"
