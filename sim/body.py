@@ -6,7 +6,7 @@ cone's axis: negative when the axis is inside.
 """
 
 from collections.abc import Sequence
-from math import cos, sin, sqrt
+from math import cos, inf, sin, sqrt
 from typing import Any, NamedTuple, Protocol
 
 MIRROR_HALF_LENGTH_M = 0.10
@@ -57,7 +57,7 @@ def outline_of(vehicle: BodyDimensions) -> Outline:
 
 
 def clearance_m(
-    outline: Outline, x_m: float, y_m: float, yaw_rad: float, cones: Sequence[tuple[float, float]]
+    outline: Outline, x_m: float, y_m: float, yaw_rad: float, cones: Sequence[Sequence[float]]
 ) -> tuple[float, int]:
     """Signed distance in m from the outline to the axis of the nearest cone, and that cone's index.
 
@@ -67,11 +67,11 @@ def clearance_m(
     rear, front, half_width, mirror_rear, mirror_front, mirror_half_width = outline
     c = cos(yaw_rad)
     s = sin(yaw_rad)
-    nearest = float("inf")
+    nearest = inf
     nearest_index = -1
-    for index, (cone_x, cone_y) in enumerate(cones):
-        dx = cone_x - x_m
-        dy = cone_y - y_m
+    for index in range(len(cones)):  # by places: an array's rows cannot be unpacked when compiled
+        dx = cones[index][0] - x_m
+        dy = cones[index][1] - y_m
         ahead = c * dx + s * dy
         aside = c * dy - s * dx
         if aside < 0.0:

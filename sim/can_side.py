@@ -241,6 +241,19 @@ def _parse(content: bytes) -> Database:
     return cast(Database, cantools.database.load_string(content.decode("utf-8"), database_format="dbc", strict=True))
 
 
+def signal_ranges(dbc_path: Path) -> dict[str, tuple[float, float, float]]:
+    """Return (value of one bit, minimum, maximum) of every signal, in its unit."""
+    _, database = _read(dbc_path)
+    signals = [signal for message in database.messages for signal in message.signals]
+    return {s.name: (float(s.scale), float(s.minimum or 0), float(s.maximum or 0)) for s in signals}
+
+
+def message_timeouts_ns(dbc_path: Path, names: Collection[str]) -> list[int]:
+    """Return the timeouts of messages as the DBC gives them."""
+    _, database = _read(dbc_path)
+    return [_timeout_ns(dbc_path, database.get_message_by_name(name)) for name in names]
+
+
 def _timeout_ns(dbc_path: Path, message: Message) -> int:
     attribute = message.dbc.attributes.get("GenMsgTimeout") if message.dbc else None
     if attribute is None:

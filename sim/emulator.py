@@ -10,7 +10,7 @@ Timing. An accepted command acts `command_latency_samples` (steering) or the sce
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sim import drive_by_wire as dbw
 from sim import plant
@@ -20,8 +20,8 @@ from sim.drive_by_wire import NEVER, PROTOCOL_VERSION, TIMED, WATCHED, Reason, S
 from sim.errors import UserError
 from sim.examiner import Examiner
 from sim.faults import FaultInjector, Frame
-from sim.plant import PERIOD_NS
-from sim.sensors import Measured, NoiseRows, first_state, measure
+from sim.plant import PERIOD_NS, TruthRow
+from sim.sensors import Measured, NoiseRows, first_state
 from sim.vehicle import rear_axle_pose
 
 VERSION_EVERY = 10
@@ -32,30 +32,6 @@ MAX_TRUTH_ROWS = 360_000
 """An hour of truth; what is older goes."""
 
 _OVERRIDES = {"steering": dbw.STEERING_OVERRIDE, "brake": dbw.BRAKE_OVERRIDE}
-
-
-class TruthRow(NamedTuple):
-    """The plant at one call of `reports`: pose of the rear-axle centre, accelerations along and across the body.
-
-    `road_wheel_angle_rad` is the true one, `road_wheel_angle_cmd_rad` the last accepted command; `gear` and `state`
-    by the DBC's values, `brake` the deceleration by the brake in m/s^2; `min_clearance_m` of this instant, to the
-    nearest cone's axis.
-    """
-
-    t_s: float
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    speed_mps: float
-    accel_x_mps2: float
-    accel_y_mps2: float
-    road_wheel_angle_rad: float
-    road_wheel_rate_radps: float
-    road_wheel_angle_cmd_rad: float
-    gear: int
-    brake: float
-    state: int
-    min_clearance_m: float
 
 
 class Emulator:
@@ -132,7 +108,7 @@ class Emulator:
     @property
     def is_safe(self) -> bool:
         """Return whether the car stands and a brake holds it."""
-        held = self._memory.target[plant.DECEL_TARGET_MPS2] > 0.0 or self._dbw[dbw.PARK_BRAKE_APPLIED] != 0
+        held = self._memory.value[plant.DECEL_TARGET_MPS2] > 0.0 or self._dbw[dbw.PARK_BRAKE_APPLIED] != 0
         return self._stands and held
 
     @property
@@ -192,7 +168,7 @@ class Emulator:
                 dbw.driver(self._car.system, self._dbw, _OVERRIDES[event.control], int(begins))
             elif event.kind == "emergency_stop":
                 dbw.press_emergency_stop(self._car.system, self._dbw, int(begins))
-        self._memory.flag[plant.IS_FROZEN] = int(self._faults.steering_is_frozen)
+        self._memory.number[plant.IS_FROZEN] = int(self._faults.steering_is_frozen)
         plant.act(self._car, self._motion, self._memory)
 
     # -- frames in ----------------------------------------------------------------------------------------------------
@@ -263,17 +239,10 @@ class Emulator:
         self.advance(now_ns)
         car, motion = self._car, self._motion
         now_ns = motion.t_ns
-        dbw.at(car.system, self._dbw, now_ns, self._stands)
         pose = rear_axle_pose(car.body, motion.body)
-        self._sensor_state, measured = measure(
-            self._sensors,
-            self._sensor_state,
-            self._noise.row(),
-            (now_ns - self._last_report_ns) * 1.0e-9,
-            plant.pose_at(car, self._memory, now_ns - car.pose_latency_ns),
-            motion.body.speed_mps,
-            motion.body.yaw_rate_radps,
-            motion.steer.rack_rad,
+        since_s = (now_ns - self._last_report_ns) * 1.0e-9
+        self._sensor_state, measured = plant.sample(
+            car, self._sensors, self._sensor_state, motion, self._memory, since_s, self._noise.row()
         )
         self._last_report_ns = now_ns
         self._note_truth(now_ns, pose)
@@ -288,31 +257,14 @@ class Emulator:
 
     def _note_truth(self, now_ns: int, pose: tuple[float, float, float]) -> None:
         t_s = (now_ns - self._start_ns) * 1.0e-9
-        motion = self._motion
-        speed = motion.body.speed_mps
-        clearance = self.examiner.observe(t_s, *pose, speed)
+        clearance = self.examiner.observe(t_s, *pose, self._motion.body.speed_mps)
         if len(self.truth) >= MAX_TRUTH_ROWS:
             del self.truth[: MAX_TRUTH_ROWS // 10]
-        self.truth.append(
-            TruthRow(
-                t_s,
-                *pose,
-                speed,
-                motion.accel_x_mps2,
-                motion.body.lateral_accel_mps2,
-                motion.steer.wheel_rad + self._car.steering.bias_rad,
-                motion.wheel_rate_radps,
-                self._memory.target[plant.ECHO_ANGLE_RAD],
-                self._dbw[dbw.GEAR],
-                motion.decel_mps2,
-                self._dbw[dbw.STATE],
-                clearance,
-            )
-        )
+        self.truth.append(plant.truth_row(self._car, self._motion, self._memory, t_s, pose, clearance))
 
     def _messages(self, now_ns: int, measured: Measured) -> list[tuple[str, dict[str, Any]]]:
         """All fast reports; the dictionaries are used again in the next tick."""
-        system, target, flag = self._dbw, self._memory.target, self._memory.flag
+        system, value, number = self._dbw, self._memory.value, self._memory.number
         timeouts = self._car.system
         rejected = self._wire.rejected_count
         by_sys, by_steer, by_long = self._received
@@ -326,9 +278,9 @@ class Emulator:
         sys["sys_cmd_rejected_count"] = rejected if rejected < REJECTED_COUNT_MAX else REJECTED_COUNT_MAX
         steer = self._steer_rpt
         steer["road_wheel_angle_meas_rad"] = measured.road_wheel_angle_rad
-        steer["road_wheel_angle_echo_rad"] = target[plant.ECHO_ANGLE_RAD]
-        steer["steer_limiting_value"] = flag[plant.LIMITED_VALUE]
-        steer["steer_limiting_rate"] = flag[plant.LIMITED_RATE]
+        steer["road_wheel_angle_echo_rad"] = value[plant.ECHO_ANGLE_RAD]
+        steer["steer_limiting_value"] = number[plant.LIMITED_VALUE]
+        steer["steer_limiting_rate"] = number[plant.LIMITED_RATE]
         steer["steer_cmd_timeout"] = int(dbw.is_timed_out(timeouts, system, dbw.STEER, now_ns))
         steer["steer_cmd_bad_crc"] = int(by_steer.bad_crc)
         steer["steer_cmd_bad_counter"] = int(by_steer.bad_counter)
@@ -341,8 +293,8 @@ class Emulator:
         long["gear_rpt"] = system[dbw.GEAR]
         long["park_brake_applied"] = system[dbw.PARK_BRAKE_APPLIED]
         long["standstill"] = int(self._stands)
-        long["speed_echo_mps"] = target[plant.ECHO_SPEED_MPS]
-        long["brake_decel_echo_mps2"] = target[plant.ECHO_DECEL_MPS2]
+        long["speed_echo_mps"] = value[plant.ECHO_SPEED_MPS]
+        long["brake_decel_echo_mps2"] = value[plant.ECHO_DECEL_MPS2]
         long["long_cmd_timeout"] = int(dbw.is_timed_out(timeouts, system, dbw.LONG, now_ns))
         long["long_cmd_bad_crc"] = int(by_long.bad_crc)
         long["long_cmd_bad_counter"] = int(by_long.bad_counter)

@@ -9,13 +9,13 @@ motion is integrated in steps of at most 1 ms that end at every instant at which
 """
 
 import random
-from collections.abc import MutableSequence
+from collections.abc import MutableSequence, Sequence
 from typing import NamedTuple
 
 from sim import drive_by_wire as dbw
 from sim.actuators import SteeringParameters, SteeringState, steering_target, step_speed, step_steering
 from sim.data_files import Course, Scenario, Side, Vehicle, check_fit, true_vehicle
-from sim.sensors import SensorParameters, parameters_of
+from sim.sensors import Measured, SensorParameters, SensorState, measure, parameters_of
 from sim.vehicle import PlantParameters, PlantState, plant_parameters, rear_axle_of, state_at_rest, step
 
 PERIOD_NS = 10_000_000
@@ -32,7 +32,7 @@ PENDING = 512
 _ROUNDING_RAD = 1.0e-9
 _MISSED_TARGET_RAD = 1.0e-4  # farther than this from its target when the next one comes: the rate limit has cut it
 
-# Slots of the record of targets and commands.
+# Slots of the record of values: targets and commands, commands on their way, the recent past.
 (
     STEER_TARGET_RAD,
     SPEED_TARGET_MPS,
@@ -43,9 +43,15 @@ _MISSED_TARGET_RAD = 1.0e-4  # farther than this from its target when the next o
     ECHO_SPEED_MPS,
     ECHO_DECEL_MPS2,
 ) = range(8)
-TARGET_SLOTS = 8
+STEER_RAD = 8
+LONG_SPEED_MPS = STEER_RAD + PENDING
+LONG_DECEL_MPS2 = LONG_SPEED_MPS + PENDING
+PAST_X_M = LONG_DECEL_MPS2 + PENDING
+PAST_Y_M = PAST_X_M + HISTORY
+PAST_YAW_RAD = PAST_Y_M + HISTORY
+VALUE_SLOTS = PAST_YAW_RAD + HISTORY
 
-# Slots of the record of flags and places.
+# Slots of the record of numbers: flags, places, and what belongs to the rows above.
 (
     LONG_ENABLE,  # of the command that acts
     GEAR_CMD,
@@ -53,14 +59,20 @@ TARGET_SLOTS = 8
     LIMITED_VALUE,
     LIMITED_RATE,
     IS_FROZEN,  # a fault holds the rack
-    STEER_FIRST,  # place of the oldest pending command, and how many there are
+    STEER_FIRST,  # place of the oldest command on its way, and how many there are
     STEER_COUNT,
     LONG_FIRST,
     LONG_COUNT,
     PAST_FIRST,
     PAST_COUNT,
 ) = range(12)
-FLAG_SLOTS = 12
+STEER_DUE_NS = 12
+LONG_DUE_NS = STEER_DUE_NS + PENDING
+LONG_GEAR = LONG_DUE_NS + PENDING
+LONG_PARK_BRAKE = LONG_GEAR + PENDING
+LONG_ENABLED = LONG_PARK_BRAKE + PENDING
+PAST_NS = LONG_ENABLED + PENDING
+NUMBER_SLOTS = PAST_NS + HISTORY
 
 Floats = MutableSequence[float]
 Ints = MutableSequence[int]
@@ -92,26 +104,39 @@ class Motion(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Records: the drive-by-wire system, targets and flags, commands on their way, and the recent past of the body.
+    """Records of the drive-by-wire system, and of targets, commands on their way and the recent past of the body.
 
-    The past is the pose of the centre of gravity (m, m, rad) at the end of each step.
+    Commands on their way and the past are rings of PENDING and HISTORY places within the records; what is too many
+    pushes out the oldest. The past is the pose of the centre of gravity (m, m, rad) at the end of each step.
     """
 
     system: Ints
-    target: Floats
-    flag: Ints
-    steer_due_ns: Ints
-    steer_rad: Floats
-    long_due_ns: Ints
-    long_speed_mps: Floats
-    long_decel_mps2: Floats
-    long_gear: Ints
-    long_park_brake: Ints
-    long_enable: Ints
-    past_ns: Ints
-    past_x_m: Floats
-    past_y_m: Floats
-    past_yaw_rad: Floats
+    number: Ints
+    value: Floats
+
+
+class TruthRow(NamedTuple):
+    """The plant at the instant of a report: pose of the rear-axle centre, accelerations along and across the body.
+
+    `road_wheel_angle_rad` is the true one, `road_wheel_angle_cmd_rad` the last accepted command; `gear` and `state`
+    by the DBC's values, `brake` the deceleration by the brake in m/s^2; `min_clearance_m` of this instant, to the
+    nearest cone's axis.
+    """
+
+    t_s: float
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    speed_mps: float
+    accel_x_mps2: float
+    accel_y_mps2: float
+    road_wheel_angle_rad: float
+    road_wheel_rate_radps: float
+    road_wheel_angle_cmd_rad: float
+    gear: int
+    brake: float
+    state: int
+    min_clearance_m: float
 
 
 class Setup(NamedTuple):
@@ -169,30 +194,14 @@ def set_up(
 
 def begin_memory(start_ns: int) -> Memory:
     """Return the records of a parked car, as lists; `begin` puts the body's past into them."""
-    return Memory(
-        system=dbw.begin(start_ns),
-        target=[0.0] * TARGET_SLOTS,
-        flag=[0] * FLAG_SLOTS,
-        steer_due_ns=[0] * PENDING,
-        steer_rad=[0.0] * PENDING,
-        long_due_ns=[0] * PENDING,
-        long_speed_mps=[0.0] * PENDING,
-        long_decel_mps2=[0.0] * PENDING,
-        long_gear=[0] * PENDING,
-        long_park_brake=[0] * PENDING,
-        long_enable=[0] * PENDING,
-        past_ns=[0] * HISTORY,
-        past_x_m=[0.0] * HISTORY,
-        past_y_m=[0.0] * HISTORY,
-        past_yaw_rad=[0.0] * HISTORY,
-    )
+    return Memory(dbw.begin(start_ns), [0] * NUMBER_SLOTS, [0.0] * VALUE_SLOTS)
 
 
 def begin(car: Car, m: Memory, start: tuple[float, float, float], start_ns: int) -> Motion:
     """Return the motion of a car that stands at the start, braked, with its wheels straight."""
     x, y, yaw = start
     body = state_at_rest(car.body, x, y, yaw)
-    m.target[DECEL_TARGET_MPS2] = dbw.BRAKE_DECEL_MPS2
+    m.value[DECEL_TARGET_MPS2] = dbw.BRAKE_DECEL_MPS2
     _remember(m, start_ns, body)
     return Motion(start_ns, body, SteeringState(0.0, 0.0, 0.0), dbw.BRAKE_DECEL_MPS2, 0.0, 0.0)
 
@@ -217,54 +226,54 @@ def advance(car: Car, motion: Motion, m: Memory, now_ns: int, stop_ns: int) -> M
 
 def _next_event_ns(m: Memory) -> int:
     event_ns = m.system[dbw.NEXT_EVENT_NS]
-    if m.flag[STEER_COUNT] != 0:
-        event_ns = min(event_ns, m.steer_due_ns[m.flag[STEER_FIRST]])
-    if m.flag[LONG_COUNT] != 0:
-        event_ns = min(event_ns, m.long_due_ns[m.flag[LONG_FIRST]])
+    if m.number[STEER_COUNT] != 0:
+        event_ns = min(event_ns, m.number[STEER_DUE_NS + m.number[STEER_FIRST]])
+    if m.number[LONG_COUNT] != 0:
+        event_ns = min(event_ns, m.number[LONG_DUE_NS + m.number[LONG_FIRST]])
     return event_ns
 
 
 def act(car: Car, motion: Motion, m: Memory) -> None:
     """Let all that is due at the present instant act."""
     now_ns = motion.t_ns
-    flag = m.flag
+    number = m.number
     dbw.at(car.system, m.system, now_ns, motion.body.speed_mps == 0.0)
-    while flag[STEER_COUNT] != 0 and m.steer_due_ns[flag[STEER_FIRST]] <= now_ns:
-        angle = m.steer_rad[flag[STEER_FIRST]]
-        flag[STEER_FIRST] = (flag[STEER_FIRST] + 1) % PENDING
-        flag[STEER_COUNT] -= 1
+    while number[STEER_COUNT] != 0 and number[STEER_DUE_NS + number[STEER_FIRST]] <= now_ns:
+        angle = m.value[STEER_RAD + number[STEER_FIRST]]
+        number[STEER_FIRST] = (number[STEER_FIRST] + 1) % PENDING
+        number[STEER_COUNT] -= 1
         if dbw.follows_steering(m.system):
-            missed = abs(m.target[STEER_TARGET_RAD] - motion.steer.demand_rad) > _MISSED_TARGET_RAD
-            flag[LIMITED_RATE] = 1 if missed else 0
-            flag[LIMITED_VALUE] = 1 if abs(angle) > car.steering.max_angle_rad + _ROUNDING_RAD else 0
-            m.target[STEER_TARGET_RAD] = steering_target(car.steering, angle)
-    while flag[LONG_COUNT] != 0 and m.long_due_ns[flag[LONG_FIRST]] <= now_ns:
-        place = flag[LONG_FIRST]
-        flag[LONG_FIRST] = (place + 1) % PENDING
-        flag[LONG_COUNT] -= 1
-        m.target[SPEED_CMD_MPS] = m.long_speed_mps[place]
-        m.target[DECEL_CMD_MPS2] = m.long_decel_mps2[place]
-        flag[GEAR_CMD] = m.long_gear[place]
-        flag[PARK_BRAKE_CMD] = m.long_park_brake[place]
-        flag[LONG_ENABLE] = m.long_enable[place]
+            missed = abs(m.value[STEER_TARGET_RAD] - motion.steer.demand_rad) > _MISSED_TARGET_RAD
+            number[LIMITED_RATE] = 1 if missed else 0
+            number[LIMITED_VALUE] = 1 if abs(angle) > car.steering.max_angle_rad + _ROUNDING_RAD else 0
+            m.value[STEER_TARGET_RAD] = steering_target(car.steering, angle)
+    while number[LONG_COUNT] != 0 and number[LONG_DUE_NS + number[LONG_FIRST]] <= now_ns:
+        place = number[LONG_FIRST]
+        number[LONG_FIRST] = (place + 1) % PENDING
+        number[LONG_COUNT] -= 1
+        m.value[SPEED_CMD_MPS] = m.value[LONG_SPEED_MPS + place]
+        m.value[DECEL_CMD_MPS2] = m.value[LONG_DECEL_MPS2 + place]
+        number[GEAR_CMD] = number[LONG_GEAR + place]
+        number[PARK_BRAKE_CMD] = number[LONG_PARK_BRAKE + place]
+        number[LONG_ENABLE] = number[LONG_ENABLED + place]
     apply_targets(car, motion, m)
 
 
 def apply_targets(car: Car, motion: Motion, m: Memory) -> None:
     """Set what drive and brake are to do, from the command that acts and the state of the vehicle."""
-    target = m.target
-    flag = m.flag
-    if not dbw.follows_speed(m.system) or flag[LONG_ENABLE] == 0:
-        target[SPEED_TARGET_MPS] = 0.0
-        target[DECEL_TARGET_MPS2] = dbw.BRAKE_DECEL_MPS2
+    value = m.value
+    number = m.number
+    if not dbw.follows_speed(m.system) or number[LONG_ENABLE] == 0:
+        value[SPEED_TARGET_MPS] = 0.0
+        value[DECEL_TARGET_MPS2] = dbw.BRAKE_DECEL_MPS2
         return
     standing = motion.body.speed_mps == 0.0
-    dbw.follow_gear(car.system, m.system, motion.t_ns, flag[GEAR_CMD], flag[PARK_BRAKE_CMD], standing)
-    speed = target[SPEED_CMD_MPS]
+    dbw.follow_gear(car.system, m.system, motion.t_ns, number[GEAR_CMD], number[PARK_BRAKE_CMD], standing)
+    speed = value[SPEED_CMD_MPS]
     if not dbw.may_drive(m.system, speed):
         speed = 0.0
-    target[SPEED_TARGET_MPS] = speed
-    target[DECEL_TARGET_MPS2] = min(target[DECEL_CMD_MPS2], car.max_decel_mps2)
+    value[SPEED_TARGET_MPS] = speed
+    value[DECEL_TARGET_MPS2] = min(value[DECEL_CMD_MPS2], car.max_decel_mps2)
 
 
 def integrate(car: Car, motion: Motion, m: Memory, until_ns: int) -> Motion:
@@ -276,10 +285,10 @@ def integrate(car: Car, motion: Motion, m: Memory, until_ns: int) -> Motion:
     span_ns = until_ns - t_ns
     count = -(-span_ns // MAX_STEP_NS)
     h = span_ns * 1.0e-9 / count
-    is_frozen = m.flag[IS_FROZEN] != 0
-    target = m.target[STEER_TARGET_RAD]
-    speed_target = m.target[SPEED_TARGET_MPS]
-    decel_target = m.target[DECEL_TARGET_MPS2]
+    is_frozen = m.number[IS_FROZEN] != 0
+    target = m.value[STEER_TARGET_RAD]
+    speed_target = m.value[SPEED_TARGET_MPS]
+    decel_target = m.value[DECEL_TARGET_MPS2]
     drive_lag = car.drive_lag_s
     brake_lag = car.brake_lag_s
     bias = car.steering.bias_rad
@@ -298,35 +307,77 @@ def integrate(car: Car, motion: Motion, m: Memory, until_ns: int) -> Motion:
 
 
 def _remember(m: Memory, t_ns: int, body: PlantState) -> None:
-    flag = m.flag
-    place = (flag[PAST_FIRST] + flag[PAST_COUNT]) % HISTORY
-    if flag[PAST_COUNT] == HISTORY:
-        flag[PAST_FIRST] = (flag[PAST_FIRST] + 1) % HISTORY
+    number = m.number
+    place = (number[PAST_FIRST] + number[PAST_COUNT]) % HISTORY
+    if number[PAST_COUNT] == HISTORY:
+        number[PAST_FIRST] = (number[PAST_FIRST] + 1) % HISTORY
     else:
-        flag[PAST_COUNT] += 1
-    m.past_ns[place] = t_ns
-    m.past_x_m[place] = body.x_m
-    m.past_y_m[place] = body.y_m
-    m.past_yaw_rad[place] = body.yaw_rad
+        number[PAST_COUNT] += 1
+    number[PAST_NS + place] = t_ns
+    m.value[PAST_X_M + place] = body.x_m
+    m.value[PAST_Y_M + place] = body.y_m
+    m.value[PAST_YAW_RAD + place] = body.yaw_rad
 
 
 def pose_at(car: Car, m: Memory, t_ns: int) -> tuple[float, float, float]:
     """Rear-axle pose at an earlier instant, between two steps by linear interpolation; forgets what is older."""
-    flag = m.flag
-    while flag[PAST_COUNT] > 1 and m.past_ns[(flag[PAST_FIRST] + 1) % HISTORY] <= t_ns:
-        flag[PAST_FIRST] = (flag[PAST_FIRST] + 1) % HISTORY
-        flag[PAST_COUNT] -= 1
-    first = flag[PAST_FIRST]
-    x = m.past_x_m[first]
-    y = m.past_y_m[first]
-    yaw = m.past_yaw_rad[first]
-    if m.past_ns[first] < t_ns and flag[PAST_COUNT] > 1:
+    number = m.number
+    while number[PAST_COUNT] > 1 and number[PAST_NS + (number[PAST_FIRST] + 1) % HISTORY] <= t_ns:
+        number[PAST_FIRST] = (number[PAST_FIRST] + 1) % HISTORY
+        number[PAST_COUNT] -= 1
+    first = number[PAST_FIRST]
+    x = m.value[PAST_X_M + first]
+    y = m.value[PAST_Y_M + first]
+    yaw = m.value[PAST_YAW_RAD + first]
+    if number[PAST_NS + first] < t_ns and number[PAST_COUNT] > 1:
         later = (first + 1) % HISTORY
-        share = (t_ns - m.past_ns[first]) / (m.past_ns[later] - m.past_ns[first])
-        x += share * (m.past_x_m[later] - x)
-        y += share * (m.past_y_m[later] - y)
-        yaw += share * (m.past_yaw_rad[later] - yaw)
+        share = (t_ns - number[PAST_NS + first]) / (number[PAST_NS + later] - number[PAST_NS + first])
+        x += share * (m.value[PAST_X_M + later] - x)
+        y += share * (m.value[PAST_Y_M + later] - y)
+        yaw += share * (m.value[PAST_YAW_RAD + later] - yaw)
     return rear_axle_of(car.body, x, y, yaw)
+
+
+# -- reports out ------------------------------------------------------------------------------------------------------
+
+
+def sample(
+    car: Car,
+    p: SensorParameters,
+    s: SensorState,
+    motion: Motion,
+    m: Memory,
+    since_s: float,
+    normals: Sequence[float],
+) -> tuple[SensorState, Measured]:
+    """Sample all sensors at the present instant, `since_s` after the last time, with a row of standard normals."""
+    dbw.at(car.system, m.system, motion.t_ns, motion.body.speed_mps == 0.0)
+    pose = pose_at(car, m, motion.t_ns - car.pose_latency_ns)
+    return measure(
+        p, s, normals, since_s, pose, motion.body.speed_mps, motion.body.yaw_rate_radps, motion.steer.rack_rad
+    )
+
+
+def truth_row(
+    car: Car, motion: Motion, m: Memory, t_s: float, pose: tuple[float, float, float], clearance_m: float
+) -> TruthRow:
+    """Return the truth of the present instant; `pose` is that of the rear-axle centre."""
+    return TruthRow(
+        t_s,
+        pose[0],
+        pose[1],
+        pose[2],
+        motion.body.speed_mps,
+        motion.accel_x_mps2,
+        motion.body.lateral_accel_mps2,
+        motion.steer.wheel_rad + car.steering.bias_rad,
+        motion.wheel_rate_radps,
+        m.value[ECHO_ANGLE_RAD],
+        m.system[dbw.GEAR],
+        motion.decel_mps2,
+        m.system[dbw.STATE],
+        clearance_m,
+    )
 
 
 # -- commands in ------------------------------------------------------------------------------------------------------
@@ -335,16 +386,16 @@ def pose_at(car: Car, m: Memory, t_ns: int) -> tuple[float, float, float]:
 def accept_steer(car: Car, motion: Motion, m: Memory, angle_rad: float, enable: int) -> None:
     """Take a valid CTRL_SteerCmd that arrives at the present instant."""
     dbw.accept(m.system, dbw.STEER, motion.t_ns)
-    m.target[ECHO_ANGLE_RAD] = angle_rad
+    m.value[ECHO_ANGLE_RAD] = angle_rad
     if enable != 0:
-        flag = m.flag
-        place = (flag[STEER_FIRST] + flag[STEER_COUNT]) % PENDING
-        if flag[STEER_COUNT] == PENDING:
-            flag[STEER_FIRST] = (flag[STEER_FIRST] + 1) % PENDING
+        number = m.number
+        place = (number[STEER_FIRST] + number[STEER_COUNT]) % PENDING
+        if number[STEER_COUNT] == PENDING:
+            number[STEER_FIRST] = (number[STEER_FIRST] + 1) % PENDING
         else:
-            flag[STEER_COUNT] += 1
-        m.steer_due_ns[place] = motion.t_ns + car.steer_latency_ns
-        m.steer_rad[place] = angle_rad
+            number[STEER_COUNT] += 1
+        number[STEER_DUE_NS + place] = motion.t_ns + car.steer_latency_ns
+        m.value[STEER_RAD + place] = angle_rad
         if car.steer_latency_ns == 0:
             act(car, motion, m)
 
@@ -361,20 +412,20 @@ def accept_long(
 ) -> None:
     """Take a valid CTRL_LongCmd that arrives at the present instant."""
     dbw.accept(m.system, dbw.LONG, motion.t_ns)
-    m.target[ECHO_SPEED_MPS] = speed_mps
-    m.target[ECHO_DECEL_MPS2] = decel_mps2
-    flag = m.flag
-    place = (flag[LONG_FIRST] + flag[LONG_COUNT]) % PENDING
-    if flag[LONG_COUNT] == PENDING:
-        flag[LONG_FIRST] = (flag[LONG_FIRST] + 1) % PENDING
+    m.value[ECHO_SPEED_MPS] = speed_mps
+    m.value[ECHO_DECEL_MPS2] = decel_mps2
+    number = m.number
+    place = (number[LONG_FIRST] + number[LONG_COUNT]) % PENDING
+    if number[LONG_COUNT] == PENDING:
+        number[LONG_FIRST] = (number[LONG_FIRST] + 1) % PENDING
     else:
-        flag[LONG_COUNT] += 1
-    m.long_due_ns[place] = motion.t_ns + car.long_latency_ns
-    m.long_speed_mps[place] = speed_mps
-    m.long_decel_mps2[place] = decel_mps2
-    m.long_gear[place] = gear
-    m.long_park_brake[place] = park_brake
-    m.long_enable[place] = enable
+        number[LONG_COUNT] += 1
+    number[LONG_DUE_NS + place] = motion.t_ns + car.long_latency_ns
+    m.value[LONG_SPEED_MPS + place] = speed_mps
+    m.value[LONG_DECEL_MPS2 + place] = decel_mps2
+    number[LONG_GEAR + place] = gear
+    number[LONG_PARK_BRAKE + place] = park_brake
+    number[LONG_ENABLED + place] = enable
     if car.long_latency_ns == 0:
         act(car, motion, m)
 
@@ -391,5 +442,5 @@ def accept_sys(car: Car, motion: Motion, m: Memory, enable: int, clear: int, leg
 def note_new_state(car: Car, motion: Motion, m: Memory) -> None:
     """Let a new state of the drive-by-wire system act."""
     if m.system[dbw.STATE] == dbw.ACTIVE and dbw.is_timed_out(car.system, m.system, dbw.LONG, motion.t_ns):
-        m.flag[LONG_ENABLE] = 0  # a command from long ago must not move the car
+        m.number[LONG_ENABLE] = 0  # a command from long ago must not move the car
     apply_targets(car, motion, m)

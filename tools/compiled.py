@@ -1,11 +1,16 @@
-"""The firmware's core through numba: the same functions, compiled, with the same bits in the result.
+"""The firmware's core and the plant through numba: the same functions, compiled, with the same bits in the result.
 
-Each core module is cloned with its functions compiled; the structs stay the very same classes, so states and outputs
+Each module is cloned with its functions compiled; the structs stay the very same classes, so states and outputs
 of the plain and the compiled core can be compared and exchanged. Tables become float64 arrays of the same shape.
 """
 
+import hashlib
 import importlib
+import os
+import shutil
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -13,6 +18,7 @@ import numpy as np
 
 from firmware_py.core.tables import GainTable, LegTable, Tables
 
+CORE = "firmware_py.core"
 CORE_MODULES = (
     "signals",
     "conditions",
@@ -32,20 +38,31 @@ CORE_MODULES = (
     "controller",
 )
 
+PLANT_MODULES = (
+    "sim.tyre",
+    "sim.vehicle",
+    "sim.actuators",
+    "sim.body",
+    "sim.sensors",
+    "sim.drive_by_wire",
+    "sim.plant",
+)
 
-def compile_modules(package: str, names: tuple[str, ...]) -> dict[str, ModuleType]:
-    """Return clones of modules of pure functions with every function compiled (lazily) by numba.
 
-    A function that one module imports from another is the compiled one in the clone too. No fastmath: the bits stay.
+def compile_modules(*names: str) -> dict[str, ModuleType]:
+    """Return clones of modules (dotted names) of pure functions with every function compiled (lazily) by numba.
+
+    A function or module that one of them imports from another is the compiled one in the clone too; what else they
+    hold stays what it is. No fastmath: the bits stay.
     """
     import numba  # noqa: PLC0415 -- half a second and 150 MiB; only where it is used
 
-    originals = {name: importlib.import_module(f"{package}.{name}") for name in names}
-    clones = {name: ModuleType(module.__name__) for name, module in originals.items()}
+    originals = {name: importlib.import_module(name) for name in names}
+    clones = {name: ModuleType(name) for name in names}
     compiled: dict[Any, Any] = {}
     for name, module in originals.items():
         for function in vars(module).values():
-            if isinstance(function, FunctionType) and function.__module__ == module.__name__:
+            if isinstance(function, FunctionType) and function.__module__ == name:
                 clone = FunctionType(
                     function.__code__, vars(clones[name]), function.__name__, function.__defaults__, None
                 )
@@ -54,16 +71,21 @@ def compile_modules(package: str, names: tuple[str, ...]) -> dict[str, ModuleTyp
         for attribute, value in vars(module).items():
             if isinstance(value, FunctionType):
                 vars(clones[name])[attribute] = compiled.get(value, value)
-            elif isinstance(value, ModuleType) and value.__name__.removeprefix(f"{package}.") in clones:
-                vars(clones[name])[attribute] = clones[value.__name__.removeprefix(f"{package}.")]
+            elif isinstance(value, ModuleType):
+                vars(clones[name])[attribute] = clones.get(value.__name__, value)
             elif attribute != "__name__":
                 vars(clones[name])[attribute] = value
     return clones
 
 
+def core_modules() -> tuple[str, ...]:
+    """Return the dotted names of all modules of the core."""
+    return tuple(f"{CORE}.{name}" for name in CORE_MODULES)
+
+
 def compiled_step() -> Callable[..., Any]:
     """Return the core's `step`, compiled; its tables are those of `array_tables`."""
-    step: Callable[..., Any] = compile_modules("firmware_py.core", CORE_MODULES)["controller"].step
+    step: Callable[..., Any] = compile_modules(*core_modules())[f"{CORE}.controller"].step
     return step
 
 
@@ -83,3 +105,66 @@ def _array_leg(leg: LegTable) -> LegTable:
     columns = {name: value for name, value in leg._asdict().items() if isinstance(value, tuple)}
     arrays: dict[str, Any] = {name: np.array(column) for name, column in columns.items()}
     return leg._replace(**arrays)
+
+
+KEPT_CACHES = 6
+"""Folders of compiled code that are kept, one a state of the sources; a megabyte or two each."""
+
+
+def cache_folder(names: tuple[str, ...], *more: str) -> Path | None:
+    """Return the folder for what numba makes of these modules (and further texts), or None where none can be had.
+
+    Its name is a hash of all sources: numba itself would look at the file of the outermost function alone, and give
+    back yesterday's code where a module below it has changed.
+    """
+    import numba  # noqa: PLC0415
+
+    digest = hashlib.sha256(f"{sys.version} numba {numba.__version__} numpy {np.__version__}".encode())
+    for name in names:
+        file = importlib.import_module(name).__file__
+        digest.update(Path(str(file)).read_bytes())
+    for text in more:
+        digest.update(text.encode())
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "parkctl" / "compiled"
+    folder = root / digest.hexdigest()[:24]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            return None
+        os.utime(folder)
+        newest_first = sorted(root.iterdir(), key=lambda other: other.stat().st_mtime, reverse=True)
+        for old in newest_first[KEPT_CACHES:]:
+            shutil.rmtree(old, ignore_errors=True)
+    except OSError:
+        return None
+    return folder
+
+
+def cached_njit(function: Any, folder: Path | None) -> Any:
+    """Return the function compiled by numba, kept on disk in the folder where there is one."""
+    import numba  # noqa: PLC0415
+
+    if folder is None:
+        return numba.njit(function)
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    try:
+        settings.CACHE_DIR = str(folder)
+        return numba.njit(cache=True)(function)
+    finally:
+        settings.CACHE_DIR = before
+
+
+def source_to_functions(source: str, namespace: dict[str, Any], folder: Path | None, file_name: str) -> dict[str, Any]:
+    """Execute generated source; as a file in the folder where there is one, since numba's cache goes by files."""
+    name = f"<{file_name}>"
+    namespace["__name__"] = __name__  # numba imports the module of what it finds in its cache
+    if folder is not None:
+        file = folder / file_name
+        if not file.exists():
+            temporary = folder / f".{file_name}.{os.getpid()}"
+            temporary.write_text(source, encoding="utf-8")
+            temporary.replace(file)
+        name = str(file)
+    exec(compile(source, name, "exec"), namespace)
+    return namespace
