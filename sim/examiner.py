@@ -1,10 +1,14 @@
-"""The examiner: watches the true pose and writes the card. Knows course, body and side, nothing of the controller."""
+"""The examiner: watches the true pose and writes the card. Knows course, body and side, nothing of the controller.
 
-from collections.abc import Sequence
-from math import cos, sin
+What is noted of each sample is a pure function on records (`observe`), so that the same source runs live and compiled;
+the card is written from the records (`Examiner.verdict`).
+"""
+
+from collections.abc import MutableSequence, Sequence
+from math import cos, inf, sin
 from typing import Any, NamedTuple
 
-from sim.body import clearance_m, outline_of
+from sim.body import Outline, clearance_m, outline_of
 from sim.data_files import Course, Pose, Side, Vehicle
 
 
@@ -65,18 +69,115 @@ class Verdict(NamedTuple):
         return card
 
 
-class _Run:
-    """A leg in the making."""
+# What the examiner has seen lives in two records (mutable rows of numbers: lists here, arrays when compiled).
+MAX_LEGS = 16
+"""Legs that are told apart; the last one holds all that come after it."""
 
-    def __init__(self, direction: int, t_s: float) -> None:
-        self.direction = direction
-        self.start_s = t_s
-        self.end_s = t_s
-        self.stops = 0
-        self.end_pose = Pose(0.0, 0.0, 0.0)
-        self.min_clearance_m = float("inf")
-        self.nearest = -1
-        self.max_speed_mps = 0.0
+# Slots of the record of counts, then a few a leg.
+LEGS, IS_MOVING, TOUCHED, KNOCKED, NEAREST = range(5)  # touched and knocked: a bit a cone; nearest: -1 before any
+LEG_COUNTS = 5
+DIRECTION, STOPS, LEG_NEAREST = range(3)
+COUNTS_A_LEG = 3
+COUNT_SLOTS = LEG_COUNTS + MAX_LEGS * COUNTS_A_LEG
+
+# Slots of the record of values, then a few a leg; times in s, poses in m and rad.
+MIN_CLEARANCE_M = 0
+LEG_VALUES = 1
+START_S, END_S, END_X_M, END_Y_M, END_YAW_RAD, LEG_CLEARANCE_M, MAX_SPEED_MPS = range(7)
+VALUES_A_LEG = 7
+VALUE_SLOTS = LEG_VALUES + MAX_LEGS * VALUES_A_LEG
+
+
+class Yardstick(NamedTuple):
+    """What the examiner measures by; `cones` are pairs (x, y) in m."""
+
+    outline: Outline
+    cones: Sequence[Sequence[float]]
+    cone_radius_m: float
+
+
+class Notes(NamedTuple):
+    """Records of what has been seen; see the slots above."""
+
+    number: MutableSequence[int]
+    value: MutableSequence[float]
+
+
+def begin_notes() -> Notes:
+    """Return the records before the first sample, as lists."""
+    notes = Notes([0] * COUNT_SLOTS, [inf] * VALUE_SLOTS)
+    notes.number[NEAREST] = -1
+    return notes
+
+
+def observe(by: Yardstick, notes: Notes, t_s: float, x_m: float, y_m: float, yaw_rad: float, speed_mps: float) -> float:
+    """Note one sample of the rear-axle centre's pose and signed speed; returns the clearance in m. Compiles."""
+    count = notes.number
+    value = notes.value
+    clearance, index = clearance_m(by.outline, x_m, y_m, yaw_rad, by.cones)
+    if clearance < value[MIN_CLEARANCE_M]:
+        value[MIN_CLEARANCE_M] = clearance
+        count[NEAREST] = index
+    if clearance < by.cone_radius_m:
+        _note_touches(by, notes, x_m, y_m, yaw_rad)
+    leg = LEG_COUNTS + (count[LEGS] - 1) * COUNTS_A_LEG
+    if speed_mps != 0.0:
+        direction = 1 if speed_mps > 0.0 else -1
+        if count[LEGS] == 0 or count[leg + DIRECTION] != direction:
+            _begin_leg(notes, direction, t_s)
+        elif count[IS_MOVING] == 0:
+            count[leg + STOPS] += 1
+        count[IS_MOVING] = 1
+    if count[LEGS] > 0:
+        leg = LEG_COUNTS + (count[LEGS] - 1) * COUNTS_A_LEG
+        row = LEG_VALUES + (count[LEGS] - 1) * VALUES_A_LEG
+        if count[IS_MOVING] != 0:
+            value[row + END_S] = t_s
+            value[row + END_X_M] = x_m
+            value[row + END_Y_M] = y_m
+            value[row + END_YAW_RAD] = yaw_rad
+            value[row + MAX_SPEED_MPS] = max(value[row + MAX_SPEED_MPS], abs(speed_mps))
+        if clearance < value[row + LEG_CLEARANCE_M]:
+            value[row + LEG_CLEARANCE_M] = clearance
+            count[leg + LEG_NEAREST] = index
+    if speed_mps == 0.0:
+        count[IS_MOVING] = 0
+    return clearance
+
+
+def _begin_leg(notes: Notes, direction: int, t_s: float) -> None:
+    count = notes.number
+    count[LEGS] = min(count[LEGS] + 1, MAX_LEGS)
+    leg = LEG_COUNTS + (count[LEGS] - 1) * COUNTS_A_LEG
+    count[leg + DIRECTION] = direction
+    count[leg + STOPS] = 0
+    count[leg + LEG_NEAREST] = -1
+    row = LEG_VALUES + (count[LEGS] - 1) * VALUES_A_LEG
+    notes.value[row + START_S] = t_s
+    notes.value[row + LEG_CLEARANCE_M] = inf
+    notes.value[row + MAX_SPEED_MPS] = 0.0
+
+
+def _note_touches(by: Yardstick, notes: Notes, x_m: float, y_m: float, yaw_rad: float) -> None:
+    for index in range(len(by.cones)):
+        distance, _ = clearance_m(by.outline, x_m, y_m, yaw_rad, by.cones[index : index + 1])
+        if distance < by.cone_radius_m:
+            notes.number[TOUCHED] |= 1 << index
+            if distance < 0.0:
+                notes.number[KNOCKED] |= 1 << index
+
+
+class _Run(NamedTuple):
+    """A leg as the records hold it."""
+
+    direction: int
+    stops: int
+    nearest: int
+    start_s: float
+    end_s: float
+    end_pose: Pose
+    min_clearance_m: float
+    max_speed_mps: float
 
 
 class Examiner:
@@ -85,55 +186,34 @@ class Examiner:
     def __init__(self, vehicle: Vehicle, course: Course, side: Side) -> None:
         self._course = course
         self._side: Side = side
-        self._outline = outline_of(vehicle)
-        self._cones = course.cones_xy(side)
+        self._yardstick = Yardstick(outline_of(vehicle), course.cones_xy(side), course.cone_radius_m)
+        self._notes = begin_notes()
         self._names = course.cone_names(side)
         self._start = course.start_pose(vehicle, side)
         self._stop = course.stop_pose(vehicle, side)
-        self._runs: list[_Run] = []
-        self._is_moving = False
-        self._touched: set[int] = set()
-        self._knocked: set[int] = set()
-        self._min_clearance_m = float("inf")
-        self._nearest = -1
 
     @property
     def cones_touched(self) -> int:
         """Cones touched or knocked down so far."""
-        return len(self._touched)
+        return self._notes.number[TOUCHED].bit_count()
 
     def observe(self, t_s: float, x_m: float, y_m: float, yaw_rad: float, speed_mps: float) -> float:
         """Take one sample of the rear-axle centre's pose and signed speed; returns the clearance in m."""
-        clearance, index = clearance_m(self._outline, x_m, y_m, yaw_rad, self._cones)
-        if clearance < self._min_clearance_m:
-            self._min_clearance_m, self._nearest = clearance, index
-        if clearance < self._course.cone_radius_m:
-            self._note_touches(x_m, y_m, yaw_rad)
-        if speed_mps != 0.0:
-            direction = 1 if speed_mps > 0.0 else -1
-            if not self._runs or self._runs[-1].direction != direction:
-                self._runs.append(_Run(direction, t_s))
-            elif not self._is_moving:
-                self._runs[-1].stops += 1
-            self._is_moving = True
-        if self._runs:
-            run = self._runs[-1]
-            if self._is_moving:
-                run.end_s, run.end_pose = t_s, Pose(x_m, y_m, yaw_rad)
-                run.max_speed_mps = max(run.max_speed_mps, abs(speed_mps))
-            if clearance < run.min_clearance_m:
-                run.min_clearance_m, run.nearest = clearance, index
-        if speed_mps == 0.0:
-            self._is_moving = False
-        return clearance
+        return observe(self._yardstick, self._notes, t_s, x_m, y_m, yaw_rad, speed_mps)
 
-    def _note_touches(self, x_m: float, y_m: float, yaw_rad: float) -> None:
-        for index, cone in enumerate(self._cones):
-            distance, _ = clearance_m(self._outline, x_m, y_m, yaw_rad, (cone,))
-            if distance < self._course.cone_radius_m:
-                self._touched.add(index)
-                if distance < 0.0:
-                    self._knocked.add(index)
+    @property
+    def _is_moving(self) -> bool:
+        return self._notes.number[IS_MOVING] != 0
+
+    @property
+    def _runs(self) -> list[_Run]:
+        runs = []
+        for index in range(self._notes.number[LEGS]):
+            place, row = LEG_COUNTS + index * COUNTS_A_LEG, LEG_VALUES + index * VALUES_A_LEG
+            direction, stops, nearest = self._notes.number[place : place + COUNTS_A_LEG]
+            start_s, end_s, x, y, yaw, clearance, speed = self._notes.value[row : row + VALUES_A_LEG]
+            runs.append(_Run(direction, stops, nearest, start_s, end_s, Pose(x, y, yaw), clearance, speed))
+        return runs
 
     def verdict(self) -> Verdict:
         """Write the card for what has been seen so far."""
@@ -151,20 +231,20 @@ class Examiner:
             full_score=sheet.full,
             pass_score=sheet.pass_,
             completed=completed,
-            cones_touched=self._cone_names(self._touched),
-            cones_knocked_down=self._cone_names(self._knocked),
+            cones_touched=self._cone_names(self._notes.number[TOUCHED]),
+            cones_knocked_down=self._cone_names(self._notes.number[KNOCKED]),
             stops=sum(leg.stops for leg in legs) + extra_turns,
             direction_changes=max(0, len(legs) - 1),
             dwell_s=legs[1].start_s - legs[0].end_s if len(legs) > 1 else 0.0,
             duration_s=legs[-1].end_s - legs[0].start_s if legs else 0.0,
-            min_clearance_m=self._min_clearance_m,
-            nearest_cone=self._names[self._nearest],
+            min_clearance_m=self._notes.value[MIN_CLEARANCE_M],
+            nearest_cone=self._names[self._notes.number[NEAREST]],
             legs=legs,
             mistakes=mistakes,
         )
 
-    def _cone_names(self, indices: set[int]) -> tuple[str, ...]:
-        return tuple(self._names[index] for index in sorted(indices))
+    def _cone_names(self, bits: int) -> tuple[str, ...]:
+        return tuple(name for index, name in enumerate(self._names) if bits >> index & 1)
 
     def _target(self, direction: int) -> Pose:
         return self._stop if direction > 0 else self._start
@@ -195,10 +275,11 @@ class Examiner:
 
     def _mistakes(self, legs: Sequence[Leg], completed: bool) -> tuple[Mistake, ...]:
         tolerances = self._course.tolerances
-        found: list[tuple[str, str]] = []
-        for index in sorted(self._touched):
-            rule = "cone_knocked_down" if index in self._knocked else "cone_bumped"
-            found.append((rule, f"cone {self._names[index]}"))
+        knocked_down = self._cone_names(self._notes.number[KNOCKED])
+        found = [
+            ("cone_knocked_down" if name in knocked_down else "cone_bumped", f"cone {name}")
+            for name in self._cone_names(self._notes.number[TOUCHED])
+        ]
         for number, leg in enumerate(legs):
             found += [("stop_to_check_progress", f"leg {number + 1}: a stop on the way")] * leg.stops
             if number >= 2:

@@ -153,7 +153,7 @@ class NoiseRows:
         self._next = 0
 
     def array(self, rows: int) -> Any:
-        """Return the next rows as a float64 array of shape (rows, NORMALS)."""
+        """Return the next rows as a float64 array of shape (rows, NORMALS); not after `row`, which draws ahead."""
         return self._rng.standard_normal((rows, NORMALS))
 
     def row(self) -> list[float]:
