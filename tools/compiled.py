@@ -46,6 +46,7 @@ PLANT_MODULES = (
     "sim.sensors",
     "sim.drive_by_wire",
     "sim.plant",
+    "sim.examiner",
 )
 
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 from firmware_py.core.signals import QUALITY_FIXED, Attitude, LongReport, MotionReport, Position, SteerReport, SysReport
 from sim import drive_by_wire as dbw
 from sim import plant
-from sim.body import Outline, clearance_m
+from sim.body import clearance_m
+from sim.examiner import Yardstick
 from sim.plant import Car, Memory, Motion, TruthRow
 from sim.sensors import SensorParameters, SensorState
 from sim.vehicle import rear_axle_pose
@@ -21,13 +22,12 @@ from tools.campaign import wire
 
 
 class World(NamedTuple):
-    """All that stays the same over a run; `cones` are pairs (x, y) in m, the last two what the localiser believes."""
+    """All that stays the same over a run; the last two are what the localiser says of itself."""
 
     car: Car
     sensors: SensorParameters
     scales: wire.Scales
-    outline: Outline
-    cones: Sequence[Sequence[float]]
+    yardstick: Yardstick
     start_ns: int
     pose_latency_ms: float
     position_sigma_m: float
@@ -53,7 +53,8 @@ class Command(NamedTuple):
     brake_decel_mps2: float
     gear: int
     park_brake: int
-    enable: int
+    steer_enable: int
+    long_enable: int
     enable_request: int
     clear_request: int
     control_leg: int
@@ -74,7 +75,8 @@ def sense(
     motion = plant.advance(car, motion, m, now_ns, dbw.NEVER)
     sensors, measured = plant.sample(car, world.sensors, sensors, motion, m, since_ns * 1.0e-9, normals)
     pose = rear_axle_pose(car.body, motion.body)
-    clearance, _ = clearance_m(world.outline, pose[0], pose[1], pose[2], world.cones)
+    by = world.yardstick
+    clearance, _ = clearance_m(by.outline, pose[0], pose[1], pose[2], by.cones)
     truth = plant.truth_row(car, motion, m, (now_ns - world.start_ns) * 1.0e-9, pose, clearance)
     system = m.system
     timeouts = car.system
@@ -147,9 +149,9 @@ def obey(world: World, motion: Motion, m: Memory, now_ns: int, command: Command)
     scales = world.scales
     motion = plant.advance(car, motion, m, now_ns, dbw.NEVER)
     angle = wire.command(command.road_wheel_angle_rad, scales.road_wheel_angle_cmd_rad)
-    plant.accept_steer(car, motion, m, angle, command.enable)
+    plant.accept_steer(car, motion, m, angle, command.steer_enable)
     speed = wire.command(command.speed_mps, scales.speed_cmd_mps)
     decel = wire.command(command.brake_decel_mps2, scales.brake_decel_cmd_mps2)
-    plant.accept_long(car, motion, m, speed, decel, command.gear, command.park_brake, command.enable)
+    plant.accept_long(car, motion, m, speed, decel, command.gear, command.park_brake, command.long_enable)
     plant.accept_sys(car, motion, m, command.enable_request, command.clear_request, command.control_leg)
     return motion

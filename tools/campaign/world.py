@@ -14,6 +14,7 @@ from sim.body import outline_of
 from sim.can_side import message_timeouts_ns
 from sim.data_files import Course, Scenario, Side, Vehicle, load_course, load_scenario, load_vehicle
 from sim.drive_by_wire import TIMED
+from sim.examiner import Yardstick
 from sim.plant import Memory, Motion, TruthRow
 from sim.sensors import NORMALS, NoiseRows, SensorState, first_state
 from tools.campaign import tick, wire
@@ -57,8 +58,7 @@ def begin(
         car=setup.car,
         sensors=setup.sensors,
         scales=scales,
-        outline=outline_of(nominal),
-        cones=course.cones_xy(side),
+        yardstick=Yardstick(outline_of(nominal), course.cones_xy(side), course.cone_radius_m),
         start_ns=0,
         pose_latency_ms=wire.report(1.0e-6 * plant.PERIOD_NS * nominal.pose_latency_samples, scales.pose_latency_ms),
         position_sigma_m=wire.report(scenario.sensors.position_noise_m, scales.position_sigma_m),
@@ -90,8 +90,8 @@ def as_arrays(memory: Memory) -> Memory:
 
 def array_world(world: World) -> World:
     """Return the world with the cones as an array, so that their number is no matter of types."""
-    cones: Any = np.array(world.cones, dtype=np.float64)
-    return world._replace(cones=cones)
+    cones: Any = np.array(world.yardstick.cones, dtype=np.float64)
+    return world._replace(yardstick=world.yardstick._replace(cones=cones))
 
 
 def compiled_tick() -> ModuleType:
@@ -120,7 +120,7 @@ def plant_entries() -> PlantEntries:
     world = array_world(beginning.world)
     state = (beginning.motion, SensorState(0.0, 0.0, 0.0, 0.0))
     _, _, reports, truth = tick.sense(beginning.world, *state, beginning.memory, 0, plant.PERIOD_NS, [0.0] * NORMALS)
-    command = Command(0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0)
+    command = Command(0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0)
     space = Namespace()
     records = "system, number, value"
     lines = [
@@ -179,7 +179,7 @@ class CompiledPlant:
         self._row = 1
         first = first_state(self._normals[0].tolist())
         world = array_world(beginning.world)
-        self._world = (np.array(flat(world), dtype=np.float64), world.cones)
+        self._world = (np.array(flat(world), dtype=np.float64), world.yardstick.cones)
         self._state = np.array(flat((beginning.motion, first)), dtype=np.float64)
         self._records = tuple(as_arrays(beginning.memory))
         self._out = np.zeros(REPORT_NUMBERS + len(TruthRow._fields))
