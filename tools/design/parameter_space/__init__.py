@@ -15,7 +15,7 @@ sampled, in a PID loop with negative feedback, C(s) = kp + ki/s + kd s/(lag s + 
     found.boundaries                                     # Boundary(kind "CRB|RRB|IRB", piece "d1|d2|d3", x, y, s, ...)
     found.absent                                         # {"IRB": "why it does not exist", ...}
     point = found.choose("centre")                       # or "smallest", "smallest on CRB d1", or found.point(x, y)
-    point.gains, point.distances                         # {"CRB d1": Distance(distance, x, y, case), ...}, nearest first
+    point.gains, point.distances                         # {"CRB d1": Distance(distance, x, y, case), ...}
     found.poles(point.x, point.y)                        # {case: poles}
 
 Over a speed grid and the corners of a box: `cases_over(plant_at, speeds, plane, region_at, box={"mass": (low, high)})`
@@ -23,8 +23,8 @@ makes one case each, and `admissible_region` takes their intersection. Other loo
 `Case(name, Characteristic(free, late, of_x, of_y, delay_s), region)`.
 
 Distances are in scaled coordinates: over the sides of the window. Whether a point is admissible is judged by the poles
-(companion-matrix eigenvalues; with a delay counted by the argument principle), never by the boundaries. A mistake in what
-is given, and an empty set, raise sim.errors.UserError with one line that says why.
+(companion-matrix eigenvalues; with a delay counted by the argument principle), never by the boundaries. A mistake in
+what is given, and an empty set, raise sim.errors.UserError with one line that says why.
 
 Source: the paper's equation 19 and Figures 11 to 13; Ackermann, "Robust Control: The Parameter Space Approach", ch. 3
 and 4 for complex-, real- and infinite-root boundaries and singular frequencies.

@@ -9,24 +9,21 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sim.errors import UserError
 from tools.design.parameter_space.boundaries import Boundary, Window, boundaries
 from tools.design.parameter_space.d_region import DRegion
 from tools.design.parameter_space.loop import (
+    Bools,
     Characteristic,
     Complexes,
     Floats,
     Pid,
     Plane,
-    Plant,
     characteristic,
     plant_of,
 )
 from tools.design.parameter_space.roots import closed_loop_poles, depth_radps
-
-Bools = npt.NDArray[np.bool_]
 
 CELLS = 81
 RULES = ("centre", "smallest", "smallest on CRB d1")
@@ -189,9 +186,11 @@ class AdmissibleRegion:
         return Point(x, y, self.plane.gains(x, y), margin >= 0.0, margin, self.scale, ordered)
 
     def choose(self, rule: str = "centre", clearance: float = LEAST_CLEARANCE) -> Point:
-        """Choose a point: "centre" is farthest from all boundaries, "smallest" has the least gains (in scaled
-        coordinates) that keep `clearance` to all boundaries, "smallest on CRB d1" the least gains on that boundary,
-        which is the paper's rule. Raises UserError for another rule and where nothing is admissible.
+        """Choose a point by a rule of `RULES`.
+
+        "centre" is farthest from all boundaries, "smallest" has the least gains (in scaled coordinates) that keep
+        `clearance` to all boundaries, "smallest on CRB d1" the least gains on that boundary, which is the paper's rule.
+        Raises UserError for another rule and where nothing is admissible.
         """
         if rule not in RULES:
             raise UserError(f"rule {rule!r}: must be one of {', '.join(RULES)}")
@@ -342,7 +341,7 @@ def _span(values: Floats, unit: float) -> tuple[float, float]:
     if least > 10.0 * LEAST_LOOKED_AT * unit:
         reach = min(most, SMALL_GAINS * least)
     elif most > 0.1 * unit / LEAST_LOOKED_AT:
-        reach = 4.0 * unit
+        reach = 2.0 * unit
     low, high = max(float(values.min()), -reach), min(float(values.max()), reach)
     room = 0.2 * max(high - low, 0.5 * reach)
     low, high = low - room, high + room

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tools.design.parameter_space.d_region import DRegion, Piece
-from tools.design.parameter_space.loop import Characteristic, Complexes, Floats
+from tools.design.parameter_space.loop import Bools, Characteristic, Complexes, Floats
 
 SINGULAR = 1e-9
 """|Im(conj(b) c)| over |b c|, below which the two equations count as dependent."""
@@ -125,7 +125,7 @@ def _complex(loop: Characteristic, piece: Piece, window: Window) -> list[Boundar
     if loop.delay_s:
         count = min(int(span * loop.delay_s / 0.05), 200_000)
         t = np.unique(np.concatenate([t, np.linspace(start, stop, max(count, 2))]))
-    a, b, c = loop.parts(piece.point(t))
+    _, b, c = loop.parts(piece.point(t))
     determinant = np.imag(np.conj(b) * c)
     if np.all(np.abs(determinant) <= SINGULAR * np.abs(b) * np.abs(c)):
         return _singular_lines(loop, piece, t, window)
@@ -143,12 +143,12 @@ def _complex(loop: Characteristic, piece: Piece, window: Window) -> list[Boundar
     return _branches(piece.name, x, y, s, window)
 
 
-def _near(window: Window, x: Floats, y: Floats, room: float = 0.5) -> Floats:
+def _near(window: Window, x: Floats, y: Floats, room: float = 0.5) -> Bools:
     width, height = window.sides
     with np.errstate(invalid="ignore"):
         near = (x >= window.x_low - room * width) & (x <= window.x_high + room * width)
         near &= (y >= window.y_low - room * height) & (y <= window.y_high + room * height)
-    return near
+    return np.asarray(near)
 
 
 def _branches(name: str, x: Floats, y: Floats, s: Complexes, window: Window) -> list[Boundary]:

@@ -26,8 +26,8 @@ class Piece(NamedTuple):
 class DRegion:
     """Poles s with Re s <= -sigma_radps, damping >= zeta, |s| <= radius_radps.
 
-    The damping is asked of poles with |s| <= zeta_within_radps only: a loop with a delay has infinitely many poles, whose
-    damping goes to zero far out, so there an unlimited wedge holds for no gains at all.
+    The damping is asked of poles with |s| <= zeta_within_radps only: a loop with a delay has infinitely many poles,
+    whose damping goes to zero far out, so there an unlimited wedge holds for no gains at all.
     """
 
     sigma_radps: float = 0.0
@@ -54,7 +54,7 @@ class DRegion:
         return math.isfinite(self.radius_radps)
 
     def depth_radps(self, s: Any) -> Floats:
-        """How deep points lie inside, in rad/s: distance to the nearest line or arc, negative outside. Continuous in s."""
+        """How deep points lie inside, in rad/s: distance to the nearest line or arc, negative outside; continuous."""
         s = np.asarray(s)
         with np.errstate(invalid="ignore"):
             depth = -s.real - self.sigma_radps
@@ -68,7 +68,7 @@ class DRegion:
         return np.asarray(depth)
 
     def real_points(self, period_s: float | None = None) -> list[tuple[str, complex]]:
-        """Where the edge meets the real axis: (name of the piece, s). A sampled loop's z < 0 is s with Im s = pi/period."""
+        """Where the edge meets the real axis: (name of the piece, s); a sampled loop's z < 0 has Im s = pi/period."""
         points: list[tuple[str, complex]] = [("d1", complex(-self.sigma_radps))]
         if self.bounded:
             points.append(("d3", complex(-self.radius_radps)))
@@ -82,7 +82,7 @@ class DRegion:
         return points
 
     def pieces(self, period_s: float | None = None) -> list[Piece]:
-        """Pieces of the edge in the upper half plane, from the real axis outward; sampled loops end at Im s = pi/period."""
+        """Pieces of the edge in the upper half plane, from the real axis outward, up to Im s = pi/period if sampled."""
         sigma, zeta, radius = self.sigma_radps, self.zeta, self.radius_radps
         sine = math.sqrt(1.0 - zeta**2)
         top = math.sqrt(radius**2 - sigma**2) if self.bounded else math.inf
@@ -90,13 +90,13 @@ class DRegion:
         wedge_end = min(radius, self.zeta_within_radps)
 
         def shift(t: Floats) -> Complexes:
-            return -sigma + 1j * t
+            return np.asarray(-sigma + 1j * t)
 
         def wedge(t: Floats) -> Complexes:
-            return t * complex(-zeta, sine)
+            return np.asarray(t * complex(-zeta, sine))
 
         def arc(size: float) -> Callable[[Floats], Complexes]:
-            return lambda t: -size * np.exp(-1j * t)
+            return lambda t: np.asarray(-size * np.exp(-1j * t))
 
         found: list[Piece] = []
         if corner >= wedge_end:  # the wedge cuts nothing off

@@ -15,6 +15,7 @@ from sim.errors import UserError
 
 Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
+Bools = npt.NDArray[np.bool_]
 
 GAINS = ("kp", "ki", "kd")
 S = np.array([1.0, 0.0])
@@ -83,7 +84,8 @@ def _coefficients(system: Any, name: str) -> tuple[Floats, Floats, float | None]
             f"{name}: has {system.ninputs} inputs and {system.noutputs} outputs; choose one of each, as in plant[0, 0]"
         )
     if all(hasattr(system, matrix) for matrix in "ABCD"):
-        num, den = _of_matrices(*(np.asarray(getattr(system, m), dtype=float) for m in "ABCD"), name)
+        a, b, c, d = (np.asarray(getattr(system, matrix), dtype=float) for matrix in "ABCD")
+        num, den = _of_matrices(a, b, c, d, name)
     elif hasattr(system, "num") and hasattr(system, "den"):
         num, den = (np.asarray(part[0][0], dtype=float) for part in (system.num, system.den))
     elif isinstance(system, Sequence) and not isinstance(system, str) and len(system) == 2:
@@ -252,8 +254,9 @@ class Characteristic(NamedTuple):
         )
 
 
-def _product(*factors: Floats) -> Floats:
-    return reduce(np.polymul, factors)
+def product_of(*factors: Floats) -> Floats:
+    """Product of polynomials."""
+    return reduce(lambda one, other: np.asarray(np.polymul(one, other), dtype=np.float64), factors)
 
 
 def characteristic(plant: Plant, plane: Plane, pid: Pid = Pid()) -> Characteristic:  # noqa: B008 -- immutable
@@ -267,7 +270,7 @@ def characteristic(plant: Plant, plane: Plane, pid: Pid = Pid()) -> Characterist
     if pid.compensator is not None:
         if pid.compensator.period_s != plant.period_s:
             raise UserError(f"{pid.compensator.name}: must have the same sampling period as {plant.name}")
-        num, den = np.polymul(num, pid.compensator.num), np.polymul(den, pid.compensator.den)
+        num, den = product_of(num, pid.compensator.num), product_of(den, pid.compensator.den)
         delay_s += pid.compensator.delay_s
     in_plane = {plane.x, plane.y}
     has_ki = "ki" in in_plane or plane.third != 0.0
@@ -286,12 +289,12 @@ def characteristic(plant: Plant, plane: Plane, pid: Pid = Pid()) -> Characterist
     if not has_kd:
         derivative_den = ONE
     effect = {
-        "kp": _product(integral_den, derivative_den, num),
-        "ki": _product(integral_num, derivative_den, num),
-        "kd": _product(integral_den, derivative_num, num),
+        "kp": product_of(integral_den, derivative_den, num),
+        "ki": product_of(integral_num, derivative_den, num),
+        "kd": product_of(integral_den, derivative_num, num),
     }
     return Characteristic(
-        free=_product(integral_den, derivative_den, den),
+        free=product_of(integral_den, derivative_den, den),
         late=plane.third * effect[plane.third_name],
         of_x=effect[plane.x],
         of_y=effect[plane.y],

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from tools.design.parameter_space.d_region import DRegion
-from tools.design.parameter_space.loop import Characteristic, Complexes, Floats, coefficients
+from tools.design.parameter_space.loop import Characteristic, Complexes, Floats, coefficients, product_of
 
 PADE_ORDER = 10
 NEWTON_STEPS = 12
@@ -28,7 +28,7 @@ BLOCK = 400
 
 
 def polynomial_roots(table: Floats) -> Complexes:
-    """Roots of polynomials given by rows, highest power first: shape (n, degree); a zero leading one gives infinities."""
+    """Roots of polynomials given by rows, highest power first: shape (n, degree); infinite for a leading zero."""
     rows, width = table.shape
     degree = width - 1
     if degree == 0:
@@ -69,8 +69,8 @@ def rational(loop: Characteristic, order: int = PADE_ORDER) -> Characteristic:
     if not loop.delay_s:
         return loop
     num, den = pade(loop.delay_s, order)
-    late, of_x, of_y = (np.polymul(num, part) for part in (loop.late, loop.of_x, loop.of_y))
-    return Characteristic(np.polymul(den, loop.free), late, of_x, of_y)
+    late, of_x, of_y = (product_of(num, part) for part in (loop.late, loop.of_x, loop.of_y))
+    return Characteristic(product_of(den, loop.free), late, of_x, of_y)
 
 
 def closed_loop_poles(loop: Characteristic, x: Floats, y: Floats, order: int = PADE_ORDER) -> Complexes:
@@ -92,16 +92,17 @@ def closed_loop_poles(loop: Characteristic, x: Floats, y: Floats, order: int = P
 def _polished(loop: Characteristic, x: Floats, y: Floats, roots: Complexes) -> Complexes:
     x, y = x[:, None], y[:, None]
     delayed = loop.late, loop.of_x, loop.of_y
-    slopes = [np.polyder(part) for part in delayed]
+    slopes = tuple(np.polyder(part) for part in delayed)
     free_slope = np.polyder(loop.free)
     s = roots.copy()
     step = np.zeros_like(s)
     with np.errstate(all="ignore"):
         for _ in range(NEWTON_STEPS):
             shift = np.exp(-loop.delay_s * s)
-            weights = (1.0, x, y)
-            late = sum(w * np.polyval(part, s) for w, part in zip(weights, delayed, strict=True))
-            late_slope = sum(w * np.polyval(part, s) for w, part in zip(weights, slopes, strict=True))
+            late, late_slope = (
+                np.polyval(parts[0], s) + x * np.polyval(parts[1], s) + y * np.polyval(parts[2], s)
+                for parts in (delayed, slopes)
+            )
             value = np.polyval(loop.free, s) + shift * late
             slope = np.polyval(free_slope, s) + shift * (late_slope - loop.delay_s * late)
             step = np.where(value == 0.0, 0.0, value / slope)
