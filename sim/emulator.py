@@ -20,11 +20,10 @@ from sim.drive_by_wire import NEVER, PROTOCOL_VERSION, TIMED, WATCHED, Reason, S
 from sim.errors import UserError
 from sim.examiner import Examiner
 from sim.faults import FaultInjector, Frame
-from sim.plant import PERIOD_NS, TruthRow
+from sim.plant import PERIOD_NS, VERSION_EVERY, TruthRow
 from sim.sensors import Measured, NoiseRows, first_state
 from sim.vehicle import rear_axle_pose
 
-VERSION_EVERY = 10
 QUALITY_FIXED = 3
 OVERRIDE_TORQUE_NM = 5.0
 REJECTED_COUNT_MAX = 1023

@@ -21,6 +21,9 @@ from sim.vehicle import PlantParameters, PlantState, plant_parameters, rear_axle
 PERIOD_NS = 10_000_000
 """Cycle of the fast reports, and the length of a sample in the vehicle file."""
 
+VERSION_EVERY = 10
+"""The vehicle tells its version with every so many-th report."""
+
 MAX_STEP_NS = 1_000_000
 
 HISTORY = 2048

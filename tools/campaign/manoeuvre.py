@@ -96,6 +96,7 @@ class Projected(NamedTuple):
 
 def drive(
     tables: Tables,
+    state: Any,
     times: Timetable,
     world: World,
     path: Path,
@@ -107,10 +108,10 @@ def drive(
 ) -> None:
     """Drive both legs, or until the car stands in a fault; the records tell how it went.
 
+    `state`: the controller's, before its first cycle (`controller.begin`, which does not compile).
     `normals`: a row for the sensors' first state, then one a cycle; where they run out, the run ends with RAN_OUT.
     """
     end = records.end
-    state: Any = controller.begin()
     sensors = first_state(normals[0])
     version = VehicleVersion(times.protocol, tables.dbc_hash24, tables.vehicle_hash24)
     oper = OperatorCommand(0, 0, 0, 0)

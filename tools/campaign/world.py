@@ -43,16 +43,20 @@ def begin(
     scenario: Scenario,
     side: Side,
     seed: int,
-    dbc: Path = DBC,
     scales: wire.Scales | None = None,
+    timeouts_ns: tuple[int, int, int, int] | None = None,
 ) -> Beginning:
     """Draw car, sensors and start as the emulator does; the time begins at 0.
 
+    What is not given (scales, and timeouts of the messages in `drive_by_wire.TIMED`) is read from the shipped DBC.
+
     Raises UserError where the car does not fit the course.
     """
-    scales = wire.load_scales(dbc) if scales is None else scales
-    sys_ns, steer_ns, long_ns, version_ns = message_timeouts_ns(dbc, TIMED)
-    setup = plant.set_up(vehicle, course, scenario, side, seed, (sys_ns, steer_ns, long_ns, version_ns))
+    scales = wire.load_scales(DBC) if scales is None else scales
+    if timeouts_ns is None:
+        sys_ns, steer_ns, long_ns, version_ns = message_timeouts_ns(DBC, TIMED)
+        timeouts_ns = (sys_ns, steer_ns, long_ns, version_ns)
+    setup = plant.set_up(vehicle, course, scenario, side, seed, timeouts_ns)
     nominal = vehicle.with_overlay(scenario.vehicle_overlay)
     world = World(
         car=setup.car,
