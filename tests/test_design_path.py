@@ -6,7 +6,9 @@ import pytest
 from sim.body import clearance_m, outline_of
 from sim.data_files import load_course, load_vehicle
 from sim.errors import UserError
-from tools.design.optimise import ANGLE_SHARE, fit_waypoints, optimise_path
+from tools.design import optimise
+from tools.design.families import fit_waypoints
+from tools.design.optimise import CHOSEN, optimise_path
 from tools.design.path import mirrored, sample
 from tools.design.path_fit import fit_path, joint_jumps, pins
 from tools.design.speed_profile import plan_speed, profile_jerk, road_wheel_slope
@@ -72,12 +74,21 @@ def test_free_ends_and_raw_parameter_are_worse_where_segments_differ_in_length()
 
 
 def test_curvature_and_slope_are_the_derivatives_of_the_sampled_path():
-    path = sample(fit_waypoints(PAPER_LIKE))
+    fit = fit_waypoints(PAPER_LIKE)
+    path = sample(fit)
     step_m = path.step_m
     assert np.hypot(np.diff(path.x_m), np.diff(path.y_m)) == pytest.approx(step_m, rel=1e-5)
     assert np.gradient(np.unwrap(path.yaw_rad), step_m)[1:-1] == pytest.approx(path.curvature_1pm[1:-1], abs=2e-4)
-    # At a joint the slope has a kink, which a difference over two steps rounds off by a hundredth of its jump.
-    assert np.gradient(path.curvature_1pm, step_m)[1:-1] == pytest.approx(path.curvature_slope_1pm2[1:-1], abs=1e-2)
+    # A difference over two steps cannot follow the kink that the slope has at a joint: there, each side by itself.
+    error = np.abs(np.gradient(path.curvature_1pm, step_m) - path.curvature_slope_1pm2)
+    joints = np.searchsorted(path.x_m, PAPER_LIKE.split_x_m)
+    inner = np.ones(len(error), dtype=bool)
+    inner[[0, -1, *joints, *(joints - 1)]] = False
+    assert error[inner].max() < 1e-3
+    k, dk = path.curvature_1pm, path.curvature_slope_1pm2
+    for at, sign in [*((joint, 1) for joint in joints), *((joint - 1, -1) for joint in joints)]:
+        one_sided = sign * (-1.5 * k[at] + 2.0 * k[at + sign] - 0.5 * k[at + 2 * sign]) / step_m
+        assert one_sided == pytest.approx(dk[at], abs=1e-3)
 
 
 def test_the_mirrored_path_is_exact():
@@ -102,15 +113,23 @@ def test_the_designed_path_has_room_and_can_be_steered(designed):
     path, outline, cones = design.path, outline_of(vehicle), course.cones_xy()
     brute_m = min(clearance_m(outline, *pose, cones)[0] for pose in zip(path.x_m, path.y_m, path.yaw_rad, strict=True))
     assert design.clearance_m == pytest.approx(brute_m, abs=1e-12)
-    assert design.clearance_m >= {"paper": 0.30, "fusion": 0.28}[vehicle.name]
-    assert design.max_road_wheel_angle_rad <= (ANGLE_SHARE + 0.01) * vehicle.max_road_wheel_angle_rad
+    least_m, least_body_m = {"paper": (0.33, 0.33), "fusion": (0.31, 0.42)}[vehicle.name]
+    assert design.clearance_m >= least_m
+    assert design.body_clearance_m >= least_body_m
+    narrow = outline_of(vehicle.with_overlay({"mirror_width_m": vehicle.body_width_m}))
+    body_m = min(clearance_m(narrow, *pose, cones)[0] for pose in zip(path.x_m, path.y_m, path.yaw_rad, strict=True))
+    assert design.body_clearance_m == pytest.approx(body_m, abs=1e-12)
+    assert design.max_road_wheel_angle_rad <= (CHOSEN.angle_share + 0.002) * vehicle.max_road_wheel_angle_rad
 
 
-def test_the_search_is_repeatable():
+def test_the_search_is_repeatable(monkeypatch):
+    """With less patience than the design's, which changes no more than how far it gets."""
+    for name, least in (("SCREENED", 20), ("STARTS", 1), ("TURN_ROUNDS", 3), ("TRIAL_ROUNDS", 3), ("FINAL_ROUNDS", 5)):
+        monkeypatch.setattr(optimise, name, least)
     vehicle, course = load_vehicle("paper"), load_course("ohio")
     first, again = (optimise_path(vehicle, course) for _ in range(2))
     assert np.array_equal(first.path.x_m, again.path.x_m)
-    assert first.waypoints == again.waypoints
+    assert first.numbers == again.numbers
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -127,8 +146,8 @@ def test_the_speed_profile_keeps_every_limit(designed, direction):
     assert np.abs(profile.speed_mps**2 * curvature).max() <= limits.accel_y_mps2 * 1.0001
     assert np.abs(profile.speed_mps * steering).max() <= limits.road_wheel_rate_radps * 1.0001
     assert np.abs(profile.accel_mps2).max() <= limits.accel_x_mps2 * 1.0001
-    moving = profile.speed_mps[1:-1] > 0.2  # below, the floor takes the place of the profile
-    assert np.abs(profile_jerk(profile)[moving]).max() <= 1.3 * limits.jerk_mps3
+    moving = profile.speed_mps[1:-1] > 0.15  # below, the floor takes the place of the profile
+    assert np.abs(profile_jerk(profile)[moving]).max() <= 1.001 * limits.jerk_mps3
     assert profile.speed_mps.max() > 0.9
 
 

@@ -71,9 +71,42 @@ def fit_path(
     leaves the end free, as printed in the paper. length_scaled: False equates raw derivatives by lambda (the paper's
     eq. 5). Raises UserError where the conditions leave nothing to fit or contradict each other.
     """
-    m, n = waypoints.x_m.shape
+    system = _system(waypoints.parameter_m, start, stop, p, q, length_scaled)
+    measured = np.stack([waypoints.x_m.ravel(), waypoints.y_m.ravel()], axis=1)
+    theta = _least_squares(system.phi, measured, system.gamma, system.target)
+    residual = float(np.max(np.abs(system.gamma @ theta - system.target), initial=0.0))
+    misfit = np.sqrt(np.mean((system.phi @ theta - measured) ** 2, axis=0))
+    coefficients = theta.reshape(len(system.length_m), p + 1, 2)
+    return FitResult(coefficients, system.length_m, residual, (float(misfit[0]), float(misfit[1])))
+
+
+def fit_changes(parameter_m: Floats, changes: Floats, *, p: int = 6, q: int = 3, pinned: int = 3) -> Floats:
+    """Change of the coefficients of one coordinate, shape (m, p + 1, k), for k changes of its waypoints.
+
+    The fit is linear in the waypoints. parameter_m: shape (m, n); changes: shape (m * n, k); at both ends the
+    derivatives of order 0 to `pinned` - 1 stay as they are.
+    """
+    unmoved = np.zeros((pinned, 2))
+    system = _system(parameter_m, unmoved, unmoved, p, q, length_scaled=True)
+    target = np.zeros((len(system.gamma), changes.shape[1]))
+    return _least_squares(system.phi, changes, system.gamma, target).reshape(len(parameter_m), p + 1, -1)
+
+
+class _System(NamedTuple):
+    """Least squares |phi theta - waypoints| subject to gamma theta = target; columns x and y."""
+
+    phi: Floats
+    gamma: Floats
+    target: Floats
+    length_m: Floats
+
+
+def _system(
+    parameter_m: Floats, start: Floats | None, stop: Floats | None, p: int, q: int, length_scaled: bool
+) -> _System:
+    m, n = parameter_m.shape
     unknowns = m * (p + 1)
-    length_m = waypoints.parameter_m[:, -1] - waypoints.parameter_m[:, 0]
+    length_m = parameter_m[:, -1] - parameter_m[:, 0]
     scale = length_m if length_scaled else np.ones(m)
 
     begin, end = _derivatives(0.0, p), _derivatives(1.0, p)
@@ -104,18 +137,12 @@ def fit_path(
         rows_of[row : row + count, segment] = table[:count] / (length_m[segment] ** order[:count])[:, None]
         target[row : row + count] = pin
         row += count
-    gamma = rows_of.reshape(conditions, unknowns)
 
-    share = (waypoints.parameter_m - waypoints.parameter_m[:, :1]) / length_m[:, None]
+    share = (parameter_m - parameter_m[:, :1]) / length_m[:, None]
     powers = np.zeros((m, n, m, p + 1))
     for segment in range(m):
         powers[segment, :, segment] = np.vander(share[segment], p + 1, increasing=True)
-    phi = powers.reshape(m * n, unknowns)
-    measured = np.stack([waypoints.x_m.ravel(), waypoints.y_m.ravel()], axis=1)
-    theta = _least_squares(phi, measured, gamma, target)
-    residual = float(np.max(np.abs(gamma @ theta - target), initial=0.0))
-    misfit = np.sqrt(np.mean((phi @ theta - measured) ** 2, axis=0))
-    return FitResult(theta.reshape(m, p + 1, 2), length_m, residual, (float(misfit[0]), float(misfit[1])))
+    return _System(powers.reshape(m * n, unknowns), rows_of.reshape(conditions, unknowns), target, length_m)
 
 
 def _least_squares(phi: Floats, measured: Floats, gamma: Floats, target: Floats) -> Floats:

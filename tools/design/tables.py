@@ -28,7 +28,18 @@ SHIPPED_FOLDER = ROOT / "firmware_py" / "tables"
 SHIPPED = (("paper", "ohio"), ("fusion", "ohio"), ("paper", "paper"))
 """Vehicles and courses whose tables come with the project."""
 
-SOURCES = ("waypoints", "path_fit", "path", "optimise", "speed_profile", "model", "gains", "tables")
+SOURCES = (
+    "waypoints",
+    "path_fit",
+    "path",
+    "families",
+    "search",
+    "optimise",
+    "speed_profile",
+    "model",
+    "gains",
+    "tables",
+)
 """Modules of the design whose text decides the tables."""
 
 # Ride: what the course's passengers and the firmware's stop allow. Sources: the paper's Table 3 for speed and
@@ -324,6 +335,7 @@ def as_json(report: DesignReport, certificate: Any) -> dict[str, Any]:
                 for profile, sign in zip(report.profiles, (1, -1), strict=True)
             ),
             "min_clearance_m": report.design.clearance_m,
+            "min_body_clearance_m": report.design.body_clearance_m,
             "nearest_cone": report.design.nearest_cone,
             "length_m": path.length_m,
             "duration_s": [profile.duration_s for profile in report.profiles],

@@ -1,13 +1,15 @@
-"""From a few waypoints to many: modified Akima interpolation, as the paper generates its waypoints.
+"""From a few waypoints to many: modified Akima interpolation, as the paper generates its waypoints, or a cubic spline.
 
-Of six waypoints, two are the start and the stop pose, one more lies on the straight line of each; between them lie the
-swing that begins the lane change and the middle of it: four numbers shape the path, three more cut it into segments.
+A turn is told by six waypoints: two are the start and the stop pose, one more lies on the straight line of each;
+between them lie the swing that begins the lane change and the middle of it. Four numbers shape such a path, three more
+cut it into segments; Akima's interpolation keeps its straights straight. Many waypoints at even steps can tell any path
+of the polynomial family; through them goes a spline, which, unlike Akima's, is a linear function of them.
 All lengths in m, angles in rad, in the course frame (x ahead, y left).
 """
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +32,7 @@ class Waypoints(NamedTuple):
     """A few waypoints and the stations (along x) at which the path is cut into polynomial segments.
 
     x_m, y_m: shape (k,), m, x strictly increasing. split_x_m: shape (m - 1,), m, strictly inside, strictly increasing.
-    start_yaw_rad, stop_yaw_rad: headings of the body at both ends.
+    start_yaw_rad, stop_yaw_rad: headings of the body at both ends. method: what runs through the waypoints.
     """
 
     x_m: tuple[float, ...]
@@ -38,6 +40,7 @@ class Waypoints(NamedTuple):
     split_x_m: tuple[float, ...]
     start_yaw_rad: float = 0.0
     stop_yaw_rad: float = 0.0
+    method: Literal["makima", "spline"] = "makima"
 
 
 class DenseWaypoints(NamedTuple):
@@ -73,21 +76,37 @@ def check_waypoints(waypoints: Waypoints) -> None:
 
 
 def interpolate(waypoints: Waypoints, per_segment: int = 41) -> DenseWaypoints:
-    """Span many waypoints between the few by modified Akima interpolation of y over x.
+    """Span many waypoints between the few by interpolation of y over x.
 
     Each segment gets `per_segment` waypoints at equal steps of x, the joints belong to both neighbours; so the result
     is a smooth function of the waypoints and the cuts, which an optimiser needs. Source: paper, figure 2 and 3.
     Raises UserError for waypoints that are out of order, too few or not finite.
     """
-    from scipy.interpolate import Akima1DInterpolator  # noqa: PLC0415  (heavy, and only the design needs it)
-
     check_waypoints(waypoints)
     borders = np.array([waypoints.x_m[0], *waypoints.split_x_m, waypoints.x_m[-1]])
     share = np.linspace(0.0, 1.0, per_segment)
     x_m = borders[:-1, None] + np.diff(borders)[:, None] * share[None, :]
     x_m[:, -1] = borders[1:]
-    curve = Akima1DInterpolator(np.array(waypoints.x_m), np.array(waypoints.y_m), method="makima")
-    return DenseWaypoints(x_m, x_m, curve(x_m))
+    return DenseWaypoints(x_m, x_m, _curve(waypoints, np.array(waypoints.y_m), x_m))
+
+
+def _curve(waypoints: Waypoints, y_m: Floats, at_m: Floats) -> Floats:
+    """Return the curve through the waypoints' x and `y_m`, shape (k, ...), at `at_m`."""
+    from scipy.interpolate import Akima1DInterpolator, CubicSpline  # noqa: PLC0415  (heavy, and only the design needs it)
+
+    x_m = np.array(waypoints.x_m)
+    if waypoints.method == "makima":
+        return np.asarray(Akima1DInterpolator(x_m, y_m, method="makima")(at_m))
+    ends = tuple(
+        (1, np.full(y_m.shape[1:], math.tan(yaw))) for yaw in (waypoints.start_yaw_rad, waypoints.stop_yaw_rad)
+    )
+    return np.asarray(CubicSpline(x_m, y_m, bc_type=ends)(at_m))
+
+
+def spline_changes(waypoints: Waypoints, at_m: Floats) -> Floats:
+    """Change of a spline at `at_m`, shape (n,), for a unit change of each waypoint but the ends; shape (n, k - 2)."""
+    straight = waypoints._replace(start_yaw_rad=0.0, stop_yaw_rad=0.0)
+    return _curve(straight, np.eye(len(waypoints.x_m))[:, 1:-1], at_m)
 
 
 def turn_waypoints(
