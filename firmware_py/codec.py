@@ -1,12 +1,14 @@
 """DBC -> Python functions that pack and unpack frames; the way of every value between bus and control law.
 
-`load_codec` reads the DBC with cantools, checks that it says what `core/signals.py` says, and writes a pair of
-functions a message as source text (kept in `Codec.source`), which it then executes. In the cycle only those functions
-run: shifts, masks, one multiplication a signal. They round half up, saturate, and never raise for any float.
+`load_codec` reads the DBC with cantools, checks that it says what `core/signals.py` says, and writes three functions a
+message as source text (kept in `Codec.source`), which it then executes. In the cycle only those functions run: shifts,
+masks, one multiplication a signal, the CRC written out. They round half up, saturate, and never raise for any float.
 """
 
 import hashlib
+import itertools
 import re
+import struct
 from collections.abc import Callable
 from math import floor
 from pathlib import Path
@@ -93,6 +95,9 @@ VALUE_TABLES: dict[str, dict[str, int]] = {
 Pack = Callable[[Any, int, Any], bytes]
 Unpack = Callable[[bytes], Any]
 
+_WORD = struct.Struct("<Q")
+"""A payload as one number: byte 0, the CRC's, is its lowest."""
+
 
 class MessageInfo(NamedTuple):
     """What the DBC says of one message."""
@@ -109,7 +114,8 @@ class Codec(NamedTuple):
     """A checked DBC with its generated functions.
 
     `pack[name](values, counter, faults) -> bytes` makes a whole frame with CRC; a NaN becomes the signal's start value
-    and adds one to `faults.nan_count`. `unpack[name](data) -> struct` reads the payload and checks nothing.
+    and adds one to `faults.nan_count`. `unpack[name](data) -> struct` reads the payload and checks nothing;
+    `receive[name](data)` gives None where the CRC is wrong. Both want 8 bytes.
     """
 
     dbc_hash24: int
@@ -117,6 +123,7 @@ class Codec(NamedTuple):
     scales: dict[str, float]
     pack: dict[str, Pack]
     unpack: dict[str, Unpack]
+    receive: dict[str, Unpack]
     source: str
 
     def scale(self, signal_name: str) -> float:
@@ -145,7 +152,14 @@ def load_codec(dbc_path: Path) -> Codec:
     except _DifferenceError as difference:
         raise UserError(f"DBC file {dbc_path}: {difference}") from None
     source = "\n\n".join(_source_of(by_name[name]) for name in STRUCTS)
-    namespace: dict[str, Any] = {"crc8": e2e.crc8, "floor": floor, **{s.__name__: s for s in STRUCTS.values()}}
+    namespace: dict[str, Any] = {
+        "floor": floor,
+        "to_bytes": _WORD.pack,
+        "from_bytes": _WORD.unpack,
+        "new": tuple.__new__,  # what a NamedTuple's own constructor calls, without its Python frame
+        **{f"crc_then_{zeros}_zeros": e2e.table_before_zeros(zeros) for zeros in range(FRAME_BYTES - 1)},
+        **{s.__name__: s for s in STRUCTS.values()},
+    }
     exec(compile(source, f"<generated from {Path(dbc_path).name}>", "exec"), namespace)
     return Codec(
         dbc_hash24=int.from_bytes(hashlib.sha256(content).digest()[:3], "big"),
@@ -153,6 +167,7 @@ def load_codec(dbc_path: Path) -> Codec:
         scales={s.name: float(s.scale) for name in STRUCTS for s in _payload(by_name[name])},
         pack={name: namespace[f"pack_{name}"] for name in STRUCTS},
         unpack={name: namespace[f"unpack_{name}"] for name in STRUCTS},
+        receive={name: namespace[f"receive_{name}"] for name in STRUCTS},
         source=source,
     )
 
@@ -233,24 +248,46 @@ def _check_value_table(by_name: dict[str, "Message"], signal_name: str, wanted: 
 
 
 def _source_of(message: "Message") -> str:
-    """Return the source text of the two functions of one message."""
+    """Return the source text of the three functions of one message."""
     payload = _payload(message)
     names = [signal.name for signal in payload]
-    struct = STRUCTS[message.name].__name__
+    values = f"new({STRUCTS[message.name].__name__}, ({', '.join(_unpack_expression(signal) for signal in payload)},))"
+    last_byte = max(signal.start + signal.length - 1 for signal in payload) // 8
     pack = [
         f"def pack_{message.name}(values, counter, faults):",
         f"    {', '.join(names)}, = values",
         *(line for signal in payload for line in _pack_lines(signal)),
         "    word = counter << 8 | " + " | ".join(f"{signal.name} << {signal.start}" for signal in payload),
-        f"    word |= crc8({message.frame_id}, word.to_bytes({FRAME_BYTES}, 'little'))",
-        f"    return word.to_bytes({FRAME_BYTES}, 'little')",
+        f"    return to_bytes(word | {_crc_expression(message.frame_id, last_byte)})",
     ]
     unpack = [
         f"def unpack_{message.name}(data):",
-        "    word = int.from_bytes(data, 'little')",
-        f"    return {struct}({', '.join(_unpack_expression(signal) for signal in payload)})",
+        "    word, = from_bytes(data)",
+        f"    return {values}",
     ]
-    return "\n".join([*pack, "", "", *unpack, ""])
+    receive = [f"def receive_{message.name}(data):", "    word, = from_bytes(data)"]
+    for last in sorted({last_byte, FRAME_BYTES - 1}):
+        # What no signal uses is zero in a right frame; where it is not, the CRC is taken over all of it.
+        condition = "else" if last > last_byte else f"if word < {1 << 8 * (last + 1):#x}"
+        receive += [
+            f"    {condition}:",
+            f"        if {_crc_expression(message.frame_id, last)} != word & 0xff: return None",
+        ]
+    receive.append(f"    return {values}")
+    return "\n".join([*pack, "", "", *unpack, "", "", *receive, ""])
+
+
+def _crc_expression(frame_id: int, last_byte: int) -> str:
+    """Return the CRC over the frame's id and bytes 1 to 7 of `word`, where those after `last_byte` are zero.
+
+    The table of the last step takes the zero bytes in one with it.
+    """
+    crc = f"{e2e.crc8_of_id(frame_id):#x}"
+    for number in range(1, last_byte + 1):
+        table = f"crc_then_{FRAME_BYTES - 1 - last_byte if number == last_byte else 0}_zeros"
+        byte = f"word >> {8 * number}" + ("" if number == last_byte else " & 0xff")
+        crc = f"{table}[{crc} ^ ({byte})]"
+    return crc
 
 
 def _raw_limits(signal: "Signal") -> tuple[int, int]:
@@ -260,15 +297,21 @@ def _raw_limits(signal: "Signal") -> tuple[int, int]:
 
 
 def _pack_lines(signal: "Signal") -> list[str]:
-    """Physical value -> raw bits, in place. The comparisons are so ordered that only a NaN reaches the `else`."""
+    """Physical value -> raw bits, in place. The comparisons are so ordered that only a NaN reaches the `else`.
+
+    What is scaled is a float and compared with floats: comparing a float with an integer takes CPython three times as
+    long.
+    """
     name = signal.name
     low, high = _raw_limits(signal)
     start = int(signal.raw_initial or 0)
     shifted = name if signal.offset == 0 else f"({name} - {signal.offset!r})"
-    lines = [f"    {name} = {shifted} / {signal.scale!r}"] if (signal.scale, signal.offset) != (1, 0) else []
+    is_scaled = (signal.scale, signal.offset) != (1, 0)
+    lines = [f"    {name} = {shifted} / {signal.scale!r}"] if is_scaled else []
+    least, most = (float(low), float(high)) if is_scaled else (low, high)
     lines += [
-        f"    if {name} < {high}: {name} = floor({name} + 0.5) if {name} > {low} else {low}",
-        f"    elif {name} >= {high}: {name} = {high}",
+        f"    if {name} < {most}: {name} = floor({name} + 0.5) if {name} > {least} else {low}",
+        f"    elif {name} >= {most}: {name} = {high}",
         "    else:",
         f"        {name} = {start}",
         "        faults.nan_count += 1",
@@ -294,13 +337,13 @@ def _unpack_expression(signal: "Signal") -> str:
 class _Slot:
     """The newest valid values of one message."""
 
-    __slots__ = ("frame_id", "partner", "receiver", "unpack", "used", "valid_bits", "values", "waiting")
+    __slots__ = ("frame_id", "partner", "receive", "receiver", "used", "valid_bits", "values", "waiting")
 
-    def __init__(self, info: MessageInfo, unpack: Unpack) -> None:
+    def __init__(self, info: MessageInfo, codec: Codec) -> None:
         self.frame_id = info.frame_id
         self.receiver = e2e.Receiver(info.timeout_ms * 1_000_000)
-        self.unpack = unpack
-        self.values: Any = unpack(bytes(FRAME_BYTES))
+        self.receive = codec.receive[info.name]
+        self.values: Any = codec.unpack[info.name](bytes(FRAME_BYTES))
         self.used = NO_COUNTER
         fields = info.struct._fields
         self.valid_bits = tuple((fields.index(b), fields.index(v)) for b, v in VALID_BITS.get(info.name, ()))
@@ -331,7 +374,7 @@ class Mailbox:
     """
 
     def __init__(self, codec: Codec) -> None:
-        self._slots = tuple(_Slot(codec.messages[name], codec.unpack[name]) for name in INPUT_MESSAGES)
+        self._slots = tuple(_Slot(codec.messages[name], codec) for name in INPUT_MESSAGES)
         self._slot_by_id = {slot.frame_id: slot for slot in self._slots}
         slot_of = dict(zip(INPUT_MESSAGES, self._slots, strict=True))
         for one, other in (PAIR, PAIR[::-1]):
@@ -359,13 +402,16 @@ class Mailbox:
                 self.foreign += 1
         elif len(data) != FRAME_BYTES:
             self.rejected_length += 1
-        elif e2e.crc8(arbitration_id, data) != data[0]:
-            self.rejected_crc += 1
-        elif slot.receiver.check(now_ns, data[1] & 0x0F) != e2e.OK:
-            self.rejected_counter += 1
         else:
-            slot.keep(data[1] & 0x0F, slot.unpack(data))
-            self.received += 1
+            values = slot.receive(data)
+            counter = data[1] & 0x0F
+            if values is None:
+                self.rejected_crc += 1
+            elif slot.receiver.check(now_ns, counter) != e2e.OK:
+                self.rejected_counter += 1
+            else:
+                slot.keep(counter, values)
+                self.received += 1
 
     def take(self, now_us: int, overruns: int) -> Inputs:
         """Return the newest valid values and which of them are new since the last call.
@@ -381,27 +427,17 @@ class Mailbox:
         return inputs
 
 
-class _Outgoing:
-    """One sent message with its rolling counter."""
-
-    __slots__ = ("counter", "frame_id", "pack")
-
-    def __init__(self, frame_id: int, pack: Pack) -> None:
-        self.frame_id = frame_id
-        self.pack = pack
-        self.counter = 0
-
-
 class Sender:
     """Sending side of the controller: one rolling counter a message; `nan_count` counts values that were no number."""
 
     def __init__(self, codec: Codec) -> None:
-        self._outgoing = {name: _Outgoing(codec.messages[name].frame_id, codec.pack[name]) for name in STRUCTS}
+        self._outgoing = {
+            name: (info.frame_id, codec.pack[name], itertools.cycle(range(e2e.COUNTER_VALUES)))
+            for name, info in codec.messages.items()
+        }
         self.nan_count = 0
 
     def pack(self, name: str, values: tuple[Any, ...]) -> tuple[int, bytes]:
         """Return (arbitration id, payload) of the next frame of the message `name`."""
-        outgoing = self._outgoing[name]
-        counter = outgoing.counter
-        outgoing.counter = (counter + 1) % e2e.COUNTER_VALUES
-        return outgoing.frame_id, outgoing.pack(values, counter, self)
+        frame_id, pack, counters = self._outgoing[name]
+        return frame_id, pack(values, next(counters), self)

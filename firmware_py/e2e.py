@@ -45,6 +45,19 @@ def crc8(data_id: int, data: bytes) -> int:
     return crc
 
 
+def crc8_of_id(data_id: int) -> int:
+    """CRC-8 over the data id alone: where the bytes of a frame go on."""
+    return _TABLE[_TABLE[data_id & 0xFF] ^ (data_id >> 8)]
+
+
+def table_before_zeros(zeros: int) -> tuple[int, ...]:
+    """Return the table of one step of the CRC and of as many steps over zero bytes after it."""
+    table = _TABLE
+    for _ in range(zeros):
+        table = tuple(_TABLE[crc] for crc in table)
+    return table
+
+
 class Receiver:
     """Judges the rolling counter of one message of one sender; bounded state, never raises.
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from firmware_py.codec import Codec, Sender
 from firmware_py.core import controller
-from firmware_py.e2e import crc8
 from firmware_py.realtime import set_up
 from tools.bench.compiled_tick import Entry, arrays_of, compile_entry
 from tools.bench.recording import Recording, record
@@ -118,11 +117,11 @@ class Codecs:
 
 def _own_way(codec: Codec, recording: Recording) -> Callable[[], object]:
     """Pack with counter and CRC, check the CRC, unpack."""
-    sender, unpack, values = Sender(codec), codec.unpack[MESSAGE], recording.outputs[recording.active[-1]].steer
+    sender, receive, values = Sender(codec), codec.receive[MESSAGE], recording.outputs[recording.active[-1]].steer
 
     def way() -> object:
-        arbitration_id, data = sender.pack(MESSAGE, values)
-        return crc8(arbitration_id, data) == data[0] and unpack(data)
+        _, data = sender.pack(MESSAGE, values)
+        return receive(data)
 
     return way
 
