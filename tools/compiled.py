@@ -67,7 +67,7 @@ def compile_modules(*names: str) -> dict[str, ModuleType]:
                 clone = FunctionType(
                     function.__code__, vars(clones[name]), function.__name__, function.__defaults__, None
                 )
-                compiled[function] = numba.njit(clone)
+                compiled[function] = numba.njit(_nrt=False)(clone)
     for name, module in originals.items():
         for attribute, value in vars(module).items():
             if isinstance(value, FunctionType):
@@ -121,7 +121,7 @@ def cache_folder(names: tuple[str, ...], *more: str) -> Path | None:
     import numba  # noqa: PLC0415
 
     digest = hashlib.sha256(f"{sys.version} numba {numba.__version__} numpy {np.__version__}".encode())
-    for name in names:
+    for name in (*names, __name__):
         file = importlib.import_module(name).__file__
         digest.update(Path(str(file)).read_bytes())
     for text in more:
@@ -146,12 +146,12 @@ def cached_njit(function: Any, folder: Path | None) -> Any:
     import numba  # noqa: PLC0415
 
     if folder is None:
-        return numba.njit(function)
+        return numba.njit(_nrt=False)(function)
     settings: Any = numba.config
     before = settings.CACHE_DIR
     try:
         settings.CACHE_DIR = str(folder)
-        return numba.njit(cache=True)(function)
+        return numba.njit(cache=True, _nrt=False)(function)
     finally:
         settings.CACHE_DIR = before
 
