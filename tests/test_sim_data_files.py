@@ -50,7 +50,7 @@ def one_line(error: pytest.ExceptionInfo[UserError]) -> str:
 
 
 def test_what_is_shipped() -> None:
-    assert shipped_names("vehicle") == ["fusion", "paper"]
+    assert shipped_names("vehicle") == ["compact", "fusion", "paper", "pickup"]
     assert shipped_names("course") == ["ohio", "paper"]
     assert set(shipped_names("scenario")) >= {
         "ideal",
@@ -104,6 +104,18 @@ def test_the_papers_car_and_the_fusion() -> None:
     assert fusion.front_overhang_m + fusion.wheelbase_m + fusion.rear_overhang_m == pytest.approx(4.87)
     assert (fusion.wheelbase_m, fusion.body_width_m, fusion.mirror_width_m) == (2.85, 1.85, 2.12)
     assert fusion.max_road_wheel_rate_radps == pytest.approx(math.radians(500.0) / fusion.steering_ratio, abs=5e-4)
+
+
+@pytest.mark.parametrize(("name", "length_m", "mirrors_m"), [("compact", 4.255, 2.03), ("pickup", 5.89, 2.12)])
+def test_the_compact_and_the_pickup(name: str, length_m: float, mirrors_m: float) -> None:
+    car = load_vehicle(name)
+    assert car.front_overhang_m + car.wheelbase_m + car.rear_overhang_m == pytest.approx(length_m, abs=3e-3)
+    assert car.mirror_width_m == mirrors_m
+    assert car.max_road_wheel_rate_radps == pytest.approx(math.radians(500.0) / car.steering_ratio, abs=1e-3)
+    low, high = car.box["wheelbase_m"]
+    assert (low, high) == pytest.approx((0.95 * car.wheelbase_m, 1.05 * car.wheelbase_m), abs=1e-3)
+    sums = [sum(pair) for pair in zip(car.box["pose_latency_samples"], car.box["command_latency_samples"], strict=True)]
+    assert sums == [1.0, 3.0]
 
 
 def test_poses_on_the_ohio_course_are_set_by_the_bumpers() -> None:
@@ -194,17 +206,17 @@ def test_a_name_is_shipped_and_a_path_is_a_path(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("papper", "no vehicle is called 'papper'; there are fusion, paper, or give the path of a .toml file"),
-        ("", "no vehicle is called ''; there are fusion, paper, or give the path of a .toml file"),
-        ("x.toml", "x.toml: no such vehicle file; give the path of a .toml file or one of the names fusion, paper"),
-        ("no/x", "no/x: no such vehicle file; give the path of a .toml file or one of the names fusion, paper"),
-        ("/", "/: no such vehicle file; give the path of a .toml file or one of the names fusion, paper"),
+        ("papper", "no vehicle is called 'papper'; there are NAMES, or give the path of a .toml file"),
+        ("", "no vehicle is called ''; there are NAMES, or give the path of a .toml file"),
+        ("x.toml", "x.toml: no such vehicle file; give the path of a .toml file or one of the names NAMES"),
+        ("no/x", "no/x: no such vehicle file; give the path of a .toml file or one of the names NAMES"),
+        ("/", "/: no such vehicle file; give the path of a .toml file or one of the names NAMES"),
     ],
 )
 def test_a_file_that_is_not_there(name: str, message: str) -> None:
     with pytest.raises(UserError) as error:
         load_vehicle(name)
-    assert one_line(error) == message
+    assert one_line(error) == message.replace("NAMES", "compact, fusion, paper, pickup")
 
 
 @pytest.mark.parametrize("kind", LOADERS)

@@ -254,7 +254,7 @@ def test_a_reader_that_goes_away_does_not_stop_the_car(start: Any) -> None:
     [
         (
             ["--vehicle", "nope"],
-            "no vehicle is called 'nope'; there are fusion, paper, or give the path of a .toml file",
+            "no vehicle is called 'nope'; there are compact, fusion, paper, pickup, or give the path of a .toml file",
         ),
         (
             ["--course", "x.toml"],
