@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import select
+from collections.abc import Collection
 from typing import Any
 
 import can
@@ -16,8 +17,10 @@ class QuickSocketcanBus(SocketcanBus):
     `recv` and `send` keep their meaning and their errors, but a full queue is refused at once whatever the timeout.
     """
 
-    def __init__(self, channel: str, **options: Any) -> None:
-        super().__init__(channel, **options)
+    def __init__(self, channel: str, only_ids: Collection[int] = ()) -> None:
+        """Open the channel; with `only_ids` the kernel passes on these 11-bit ids and error frames, nothing else."""
+        filters: Any = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in sorted(only_ids)]
+        super().__init__(channel, can_filters=filters or None)
         self.socket.setblocking(False)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:

@@ -179,6 +179,26 @@ def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Sess
     assert speeds[-1] == 0.0
 
 
+# ------------------------------------------------------------------------------------------------------------- flood
+
+
+def test_a_flood_of_foreign_ids_at_full_rate_is_driven_through(session: Session) -> None:
+    """Two generators without a pause: the kernel's filters keep them from car, controller and operator station."""
+    flood, folder = session.figures["flood"], session.folder
+    assert flood["driving"]
+    assert flood["frames_per_s"] > 5 * 1800, "five times what the bus carries beside it"
+    assert flood["after"]["mode"] == 2, flood["after"]["reason_text"]
+    assert abs(flood["after"]["station_m"] - flood["before"]["station_m"]) > 2.0
+    final = flood["final"]
+    assert (final["frames_foreign"], final["drains_cut"], final["receive_failed"]) == (0, 0, 0)
+    # Stopped by the operator in the end, in good order on all sides.
+    assert final["reason_text"].startswith("stopped by the operator")
+    assert (flood["controller_status"], flood["operator_status"], flood["emulator_status"]) == (3, 0, 0)
+    for said in (folder / "flood").glob("*.txt"):
+        assert "Traceback" not in said.read_text(), said.name
+    assert "Traceback" not in (folder / "flood_controller/controller.txt").read_text()
+
+
 # ------------------------------------------------------------------------------------------------------------ replay
 
 

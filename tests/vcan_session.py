@@ -1,4 +1,4 @@
-"""What the tests of the real vcan0 do inside the guest: one boot, three runs, all results as files in FOLDER.
+"""What the tests of the real vcan0 do inside the guest: one boot, four runs, all results as files in FOLDER.
 
 `python vcan_session.py FOLDER IDS`: IDS are the frame ids, in hexadecimal, that a replay feeds to the controller.
 Standard library only: every import costs its time again in the guest.
@@ -27,6 +27,7 @@ BUS = ["-i", "socketcan", "-c", "vcan0"]
 ACTIVE = 2
 FORGED_EACH = 5
 ERROR_FRAMES = 4
+FLOOD_S = 5.0
 FED_AFTER_START_S = 9.0
 """So long after the start button the recorded frames are fed."""
 ATTEMPTS = 3
@@ -157,6 +158,51 @@ def disturbances() -> None:
     end(recorder)
 
 
+def packets() -> int:
+    return int(Path("/sys/class/net/vcan0/statistics/tx_packets").read_text())
+
+
+def flood() -> None:
+    """Foreign frames as fast as they can be sent, while the car drives; then the operator stops it."""
+    folder = FOLDER / "flood"
+    folder.mkdir()
+    car = start(
+        *(sys.executable, "-P", "-m", "sim", *BUS, "--status", "--out", folder),
+        stdout=(folder / "emulator.jsonl").open("wb"), stderr=(folder / "emulator.txt").open("wb"),
+    )  # fmt: skip
+    controller = Controller("flood_controller")
+    operator = start(
+        "parkctl", "operate", *BUS, "--auto", priority=10, stdout=(folder / "operate.txt").open("wb"),
+        stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    driving = controller.wait_for(lambda report: report.get("mode") == ACTIVE, 60.0)
+    time.sleep(2.0)
+    before, sent = controller.reports()[-1], packets()
+    generators = [start("cangen", "vcan0", "-i", "-g", "0", "-I", number, "-L", "8") for number in ("000", "7A5")]
+    time.sleep(FLOOD_S)
+    figures["flood"] = {"driving": driving, "frames_per_s": (packets() - sent) / FLOOD_S, "before": before}
+    for generator in generators:
+        end(generator)
+    time.sleep(0.5)
+    after = controller.reports()[-1]
+    figures["flood"] |= {
+        "after": after,
+        "operator_status": end(operator, signal.SIGINT),
+        "controller_status": wait_or_kill(controller.process),
+        "emulator_status": end(car, signal.SIGINT),
+        "final": controller.reports()[-1].get("final"),
+    }
+
+
+def wait_or_kill(process: subprocess.Popen[bytes]) -> int | None:
+    """Return the exit status of a process that should end by itself; None where it hangs."""
+    try:
+        return process.wait(20.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return None
+
+
 def replay() -> None:
     """The recorded frames of car, localisation and operator, fed by canplayer; cantools monitor on a terminal."""
     fed = FOLDER / "fed.log"
@@ -216,7 +262,7 @@ with open(sys.argv[1], "wb") as file:
 
 
 if __name__ == "__main__":
-    for step in (manoeuvre, disturbances, replay):
+    for step in (manoeuvre, disturbances, flood, replay):
         began_s = time.monotonic()
         step()
         figures[f"{step.__name__}_s"] = time.monotonic() - began_s

@@ -7,7 +7,7 @@ import errno
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from sim.errors import UserError
@@ -69,9 +69,17 @@ def environment_without_can_settings() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("CAN_")}
 
 
-def open_bus(interface: str | None, channel: str | None, bitrate: int | None, *, ignore_settings: bool) -> can.BusABC:
+def open_bus(
+    interface: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    *,
+    ignore_settings: bool,
+    only_ids: Collection[int] = (),
+) -> can.BusABC:
     """Open a bus; with `ignore_settings` neither CAN_* variables nor can.conf files are read.
 
+    With `only_ids` the kernel passes on these 11-bit ids only, where the interface is SocketCAN and named in full.
     Raises UserError, one line, where the interface, the channel or the settings are wrong.
     """
     import can  # noqa: PLC0415
@@ -84,7 +92,7 @@ def open_bus(interface: str | None, channel: str | None, bitrate: int | None, *,
         if interface == "socketcan" and channel is not None:
             from sim.quick_socketcan import QuickSocketcanBus  # noqa: PLC0415
 
-            return QuickSocketcanBus(channel)
+            return QuickSocketcanBus(channel, only_ids)
         return can.Bus(ignore_config=ignore_settings, **given)  # type: ignore[arg-type]
     except OSError as error:
         if error.errno == errno.EAFNOSUPPORT:

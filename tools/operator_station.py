@@ -209,7 +209,8 @@ def run(args: argparse.Namespace) -> int:
     interface, channel = args.interface, args.channel
     if interface is None and not _is_configured():
         interface = "loopbus"
-    with opened(open_bus(interface, channel, args.bitrate, ignore_settings=interface is not None)) as bus:
+    ids = station.frame_ids.values()
+    with opened(open_bus(interface, channel, args.bitrate, ignore_settings=interface is not None, only_ids=ids)) as bus:
         return _Console(station, bus, auto=args.auto, slow_motion=args.slow_motion).run()
 
 
