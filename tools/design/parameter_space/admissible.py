@@ -273,6 +273,8 @@ def admissible_region(
 
 
 LEAST_LOOKED_AT = 1e-6
+LOOKED_AT = (3, 9)
+"""Values a decade, first and, where nothing is found, then."""
 SMALL_GAINS = 12.0
 """Where the least admissible gain is not about zero, the window ends at this many times it."""
 
@@ -303,20 +305,42 @@ def find_window(cases: Sequence[Case], plane: Plane) -> Window:
     """
     weights = np.array([_balancing_gains(case) for case in cases])
     unit_x, unit_y = np.exp(np.mean(np.log(weights), axis=0))
-    sizes = np.geomspace(LEAST_LOOKED_AT, 1.0 / LEAST_LOOKED_AT, 37)
-    values = np.concatenate([-sizes[::-1], [0.0], sizes])
-    grid_x, grid_y = (grid.ravel() for grid in np.meshgrid(unit_x * values, unit_y * values))
-    inside = np.ones(len(grid_x), dtype=bool)
-    for case in cases:
-        left = np.flatnonzero(inside)
-        inside[left] = depth_radps(case.loop, case.region, grid_x[left], grid_y[left]) >= 0.0
-    if not inside.any():
-        far_x, far_y = unit_x * values[-1], unit_y * values[-1]
+    x, y = np.empty(0), np.empty(0)
+    for decades_of in LOOKED_AT:
+        sizes = np.geomspace(LEAST_LOOKED_AT, 1.0 / LEAST_LOOKED_AT, decades_of * 12 + 1)
+        values = np.concatenate([-sizes[::-1], [0.0], sizes])
+        grid_x, grid_y = (grid.ravel() for grid in np.meshgrid(unit_x * values, unit_y * values))
+        inside = _all_inside(cases, grid_x, grid_y)
+        x, y = grid_x[inside], grid_y[inside]
+        if len(x):
+            break
+    else:
+        far_x, far_y = unit_x / LEAST_LOOKED_AT, unit_y / LEAST_LOOKED_AT
         raise empty_error(plane, Window(-far_x, far_x, -far_y, far_y), cases, (grid_x, grid_y))
-    x, y = grid_x[inside], grid_y[inside]
     x_low, x_high = _span(x, unit_x)
     seen = (x >= x_low) & (x <= x_high)
-    return Window(x_low, x_high, *_span(y[seen], unit_y))
+    rough = Window(x_low, x_high, *_span(y[seen], unit_y))
+    # The steps are wide: look again, closer, at a window that reaches a step farther.
+    step = (1.0 / LEAST_LOOKED_AT**2) ** (1.0 / (len(sizes) - 1))
+    wide_x, wide_y = (np.linspace(*_wider(low, high, step), 61) for low, high in (rough[:2], rough[2:]))
+    grid_x, grid_y = (grid.ravel() for grid in np.meshgrid(wide_x, wide_y))
+    inside = _all_inside(cases, grid_x, grid_y)
+    if not inside.any():
+        return rough
+    return Window(*_span(grid_x[inside], unit_x, rough[:2]), *_span(grid_y[inside], unit_y, rough[2:]))
+
+
+def _all_inside(cases: Sequence[Case], x: Floats, y: Floats) -> Bools:
+    inside = np.ones(len(x), dtype=bool)
+    for case in cases:
+        left = np.flatnonzero(inside)
+        inside[left] = depth_radps(case.loop, case.region, x[left], y[left]) >= 0.0
+    return inside
+
+
+def _wider(low: float, high: float, step: float) -> tuple[float, float]:
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    return middle - step * half - 0.3 * abs(middle), middle + step * half + 0.3 * abs(middle)
 
 
 def _balancing_gains(case: Case) -> tuple[float, float]:
@@ -334,16 +358,18 @@ def _balancing_gains(case: Case) -> tuple[float, float]:
     return float(np.exp(np.mean(np.log(a / b)))), float(np.exp(np.mean(np.log(a / c))))
 
 
-def _span(values: Floats, unit: float) -> tuple[float, float]:
+def _span(values: Floats, unit: float, rough: tuple[float, float] | None = None) -> tuple[float, float]:
     """Side of a window about the admissible values of one gain, with the zero where it is near."""
     least, most = float(np.abs(values).min()), float(np.abs(values).max())
     reach = most
-    if least > 10.0 * LEAST_LOOKED_AT * unit:
+    if rough is not None:
+        reach = min(most, 1.3 * max(abs(rough[0]), abs(rough[1])))
+    elif least > 10.0 * LEAST_LOOKED_AT * unit:
         reach = min(most, SMALL_GAINS * least)
     elif most > 0.1 * unit / LEAST_LOOKED_AT:
         reach = 2.0 * unit
     low, high = max(float(values.min()), -reach), min(float(values.max()), reach)
-    room = 0.2 * max(high - low, 0.5 * reach)
+    room = 0.2 * max(high - low, 0.1 * reach)
     low, high = low - room, high + room
     if 0.0 < low < 0.5 * high:
         low = -0.05 * high

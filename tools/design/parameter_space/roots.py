@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from tools.design.parameter_space.d_region import DRegion
+from tools.design.parameter_space.d_region import DRegion, Piece
 from tools.design.parameter_space.loop import Characteristic, Complexes, Floats, coefficients, product_of
 
 PADE_ORDER = 10
@@ -23,7 +23,7 @@ CONVERGED = 1e-9
 COUNT_POINTS = 1200
 UNSURE_RAD = 2.0
 """A turn of the phase between two points that is larger than this is looked at again with more points."""
-FINER = 20
+REFINEMENTS = 40
 BLOCK = 400
 
 
@@ -146,55 +146,72 @@ def poles_outside(loop: Characteristic, region: DRegion, x: Floats, y: Floats) -
     that |p / q - 1| < 1 far out; the caller sees to it.
     """
     x, y = np.asarray(x, dtype=float).ravel(), np.asarray(y, dtype=float).ravel()
-    edge = _edge(loop, region, COUNT_POINTS)
+    edge = _edge(loop, region)
     counts = np.empty(len(x))
     for start in range(0, len(x), BLOCK):
         block = slice(start, start + BLOCK)
-        counts[block] = _turns(loop, region, edge, x[block], y[block])
-    unsure = np.flatnonzero(np.isnan(counts))
-    fine = _edge(loop, region, FINER * COUNT_POINTS) if unsure.size else edge
-    for index in unsure:
-        counts[index] = _turns(loop, region, fine, x[index : index + 1], y[index : index + 1])[0]
+        counts[block] = _turns(loop, region, [piece.point(t) for piece, t in edge], x[block], y[block])
+    for index in np.flatnonzero(np.isnan(counts)):
+        counts[index] = _turns_of_one(loop, region, edge, float(x[index]), float(y[index]))
     return counts
 
 
-def _edge(loop: Characteristic, region: DRegion, points: int) -> Complexes:
-    """Points along the upper half of the edge, from the real axis to far out, dense where loop or delay want it."""
+def _edge(loop: Characteristic, region: DRegion) -> list[tuple[Piece, Floats]]:
+    """Pieces of the upper half of the edge with parameters along them, from the real axis to far out."""
     marks = [np.abs(np.roots(part)) for part in loop[:4] if np.trim_zeros(part, "f").size > 1]
     sizes = np.concatenate([*marks, [region.sigma_radps, 1.0 / loop.delay_s if loop.delay_s else 0.0]])
     sizes = sizes[sizes > 0.0]
     low = 1e-4 * float(sizes.min()) if sizes.size else 1e-4
     high = 1e5 * float(sizes.max()) if sizes.size else 1e5
-    parts = []
+    edge = []
     for piece in region.pieces(loop.period_s):
-        stop = min(piece.stop, high)
-        if math.isinf(piece.stop) or (piece.stop > 10.0 * low and piece.name != "d3"):
-            first = piece.start + low
-            t = np.concatenate([[piece.start], piece.start + np.geomspace(low, max(stop - piece.start, first), points)])
-            if math.isfinite(piece.stop):
-                t = np.unique(np.concatenate([t[t < stop], stop - np.geomspace(low, stop - piece.start, points // 4)]))
-                t = np.append(t[t >= piece.start], stop)
+        stop = piece.stop if math.isfinite(piece.stop) else piece.start + high
+        span = stop - piece.start
+        if span > 10.0 * low:
+            t = piece.start + np.concatenate([[0.0], np.geomspace(low, span, COUNT_POINTS)])
         else:
-            t = np.linspace(piece.start, stop, points // 2)
+            t = np.linspace(piece.start, stop, 100)
+        if math.isfinite(piece.stop):
+            t = np.concatenate([t, np.linspace(piece.start, stop, COUNT_POINTS // 2)])
         if loop.delay_s:
-            turns = np.arange(piece.start, min(stop, 100.0 / loop.delay_s), 0.1 / loop.delay_s)
-            t = np.unique(np.concatenate([t, turns]))
-        parts.append(piece.point(t))
-    return np.concatenate(parts)
+            t = np.concatenate([t, np.arange(piece.start, min(stop, 100.0 / loop.delay_s), 0.1 / loop.delay_s)])
+        edge.append((piece, np.unique(np.clip(t, piece.start, stop))))
+    return edge
 
 
-def _turns(loop: Characteristic, region: DRegion, edge: Complexes, x: Floats, y: Floats) -> Floats:
-    a, b, c = loop.parts(edge)
-    degree = loop.degree
-    # Reference with all roots inside the region, as far out as the loop's own poles.
+def _normal(loop: Characteristic, region: DRegion, s: Complexes) -> tuple[Complexes, Complexes, Complexes]:
+    """Parts of p over a polynomial of its degree with all roots inside the region, as far out as the loop's own."""
     own = np.sort(np.abs(np.roots(np.trim_zeros(loop.free, "f"))))[::-1]
-    own = np.concatenate([own, np.zeros(max(0, degree - len(own)))])[:degree]
+    own = np.concatenate([own, np.zeros(max(0, loop.degree - len(own)))])[: loop.degree]
     floor = region.sigma_radps + 1e-3 * (own.max(initial=0.0) + region.sigma_radps) + 1e-9
-    reference = np.prod(edge[:, None] + np.maximum(own, floor), axis=1)
-    a, b, c = a / reference, b / reference, c / reference
+    reference = np.prod(s[:, None] + np.maximum(own, floor), axis=1)
+    a, b, c = loop.parts(s)
+    return a / reference, b / reference, c / reference
+
+
+def _turns(loop: Characteristic, region: DRegion, edge: list[Complexes], x: Floats, y: Floats) -> Floats:
+    a, b, c = _normal(loop, region, np.concatenate(edge))
     f = a + x[:, None] * b + y[:, None] * c
     steps = np.angle(f[:, 1:] * np.conj(f[:, :-1]))
-    total = steps.sum(axis=1) + np.angle(f[:, 0] / np.sign(f[:, 0].real)) - np.angle(f[:, -1])
+    # p / q is real where the edge leaves the real axis and tends to 1 at its far end.
+    first = np.where(f[:, 0].real < 0.0, -f[:, 0], f[:, 0])
+    total = steps.sum(axis=1) + np.angle(first) - np.angle(f[:, -1])
     counts = -total / math.pi
-    unsure = (np.abs(steps) > UNSURE_RAD).any(axis=1) | (np.abs(counts - np.round(counts)) > 0.05)
-    return np.where(unsure, np.nan, np.round(counts))
+    unsure = (np.abs(steps) > UNSURE_RAD).any(axis=1) | ~(np.abs(counts - np.round(counts)) < 0.05)
+    return np.where(unsure | (f == 0.0).any(axis=1), np.nan, np.round(counts))
+
+
+def _turns_of_one(loop: Characteristic, region: DRegion, edge: list[tuple[Piece, Floats]], x: float, y: float) -> float:
+    """The count for one point, with more points along the edge wherever the phase turns fast."""
+    fine = []
+    for piece, parameters in edge:
+        t = parameters
+        for _ in range(REFINEMENTS):
+            a, b, c = _normal(loop, region, piece.point(t))
+            f = a + x * b + y * c
+            fast = np.abs(np.angle(f[1:] * np.conj(f[:-1]))) > 0.5 * UNSURE_RAD
+            if not fast.any() or len(t) > 50 * COUNT_POINTS:
+                break
+            t = np.sort(np.concatenate([t, 0.5 * (t[1:] + t[:-1])[fast]]))
+        fine.append(piece.point(t))
+    return float(_turns(loop, region, fine, np.array([x]), np.array([y]))[0])
