@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-vcan quick live soak soak-loopbus soak-vcan0 design wheel clean
+.PHONY: help install demo test test-vcan test-can-hw quick live soak soak-loopbus soak-vcan0 design wheel clean
 
 VENV := .venv
 STAMP := $(VENV)/.installed
@@ -14,6 +14,7 @@ help:
 	@echo "make demo     the car takes the test by itself, forward and in reverse (about 40 s); more: .venv/bin/parkctl demo --help"
 	@echo "make test     lint, format, types, all tests"
 	@echo "make test-vcan  only those on a real vcan0, in a guest kernel (2 min; once before: .venv/bin/parkctl guest --install)"
+	@echo "make test-can-hw  the driver of a physical interface: two emulated CAN cards, slow motion (10 min; needs QEMU)"
 	@echo "make soak     18 tests in a row on loopbus, then on vcan0, cyclictest beside them (20 min; SOAK_RUNS=2 for a look)"
 	@echo "make design   makes the shipped tables anew from the vehicle and course files"
 	@echo "make wheel    builds dist/parkctl_controller-*.whl, the controller alone, for the car"
@@ -38,7 +39,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "make: error: $$python cannot make virtual environments; on Debian and Ubuntu install python3-venv" >&2; exit 1; }; \
 	echo "setting up $(VENV) with $$("$$python" --version) (once; takes about a minute)"; \
 	"$$python" -m venv --clear $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[tools,test]' -c constraints.txt
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[tools,cluster,test]' -c constraints.txt
 	@touch $@
 
 demo: $(STAMP)
@@ -66,6 +67,11 @@ live: $(STAMP)
 # Part of `live` too, where the guest is installed.
 test-vcan: $(STAMP)
 	$(BIN)/pytest tests/test_vcan_live.py tests/test_vcan_mistakes.py
+
+# Says first how long it takes; SLOW_MOTION=10 is quicker, on an idle machine. Where something is missing it says what.
+test-can-hw: $(STAMP)
+	$(BIN)/parkctl guest --hardware --check
+	$(BIN)/pytest -s tests/can_hw.py
 
 SOAK_RUNS ?= 18
 soak: soak-loopbus soak-vcan0
