@@ -18,6 +18,7 @@ COMMANDS = {
     "demo": ("tools.demo", "the whole test: car and controller as processes of their own, judged by the examiner"),
     "operate": ("tools.operator_station", "the operator station alone: start, stop, emergency stop, clear by keys"),
     "design": ("tools.design_cmd", "make or check the controller's tables from vehicle and course files"),
+    "paper": ("tools.paper.command", "the paper's tables and figures, ours beside the printed ones, on one page"),
     "deploy": (
         "tools.deploy.command",
         "what goes into the car: the wheel of the controller alone, with its systemd units",
@@ -35,7 +36,7 @@ PROCESSES = {
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "deploy", "bench", "soak", "guest")
+ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "paper", "deploy", "bench", "soak", "guest")
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2
