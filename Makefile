@@ -70,8 +70,7 @@ test-vcan: $(STAMP)
 
 # Says first how long it takes; SLOW_MOTION=10 is quicker, on an idle machine. Where something is missing it says what.
 test-can-hw: $(STAMP)
-	$(BIN)/parkctl guest --hardware --check
-	$(BIN)/pytest -s tests/can_hw.py
+	@$(BIN)/pytest -q -s tests/can_hw.py
 
 SOAK_RUNS ?= 18
 soak: soak-loopbus soak-vcan0

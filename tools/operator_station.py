@@ -272,7 +272,8 @@ class _Console:
             moving = not station.is_silent("VEH_LongRpt", now_ns) and not station.standstill
             return 0 if self._quits > 1 or not moving else None
         if self._auto and self._was_active and station.standstill:
-            if station.leg == COMPLETE:
+            # Not before the car is parked: a controller that still waits for the gear misses its operator.
+            if station.mode == MANUAL and station.reason == COMPLETE:
                 return 0
             if station.mode == FAULT or station.is_silent("CTRL_SysCmd", now_ns):
                 print(f"parkctl: stopped: {station.reason_text}", file=sys.stderr)

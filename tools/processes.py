@@ -17,7 +17,7 @@ STATUS_USER_ERROR = 2
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """Have the kernel end this process when its parent is killed; runs in the child, between fork and exec."""
     if sys.platform == "linux":
         import ctypes  # noqa: PLC0415
@@ -46,7 +46,7 @@ class Child:
             stderr=subprocess.PIPE,
             env=environment_without_can_settings() | {"PYTHONUNBUFFERED": "1"},
             process_group=0,
-            preexec_fn=_die_with_parent,  # noqa: PLW1509  no thread runs here
+            preexec_fn=die_with_parent,  # noqa: PLW1509  no thread runs here
         )
         for pipe in (self.process.stdout, self.process.stderr):
             assert pipe is not None

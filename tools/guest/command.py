@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim.errors import UserError
-from tools.guest import image, session
+from tools.guest import hardware, image, session
 
 if TYPE_CHECKING:
     import argparse
@@ -18,7 +18,7 @@ DEFAULT_RESULTS = "runs"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `parkctl guest`."""
-    parser.usage = "parkctl guest [--install] [--results DIR]... [--] COMMAND [ARGUMENT]..."
+    parser.usage = "parkctl guest [--hardware] [--install] [--results DIR]... [--] COMMAND [ARGUMENT]..."
     parser.epilog = (
         "The guest is Debian's user-mode-linux: an ordinary process, no root needed. It sees this machine's files, "
         "read-only but for the folders of --results; there is no network, one CPU, and vcan0 is up. On a terminal the "
@@ -27,6 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--install", action="store_true", help=f"fetch what is needed into {image.image_folder()}, with apt-get"
+    )
+    parser.add_argument(
+        "--hardware",
+        action="store_true",
+        help="in place of vcan0 an emulated machine (QEMU) with two CAN cards, can0 and can1, on one bus: the real "
+        "driver, but some fifty times slower; needs qemu-system-x86, and --install fetches its kernel",
     )
     parser.add_argument(
         "--results",
@@ -41,16 +47,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command in the guest; return its exit status. Raises UserError where that cannot be."""
     if args.install:
-        print(f"guest installed in {image.install()}")
+        print(f"guest installed in {hardware.install() if args.hardware else image.install()}")
         if not args.command:
             return 0
     if not args.command:
         raise UserError("guest: name the command to run, as in: parkctl guest -- candump vcan0")
     if "PARKCTL_IN_GUEST" in os.environ:
         raise UserError("guest: this is the guest already; run the command by itself")
-    found = image.find_image()
+    reason = hardware.why_not() if args.hardware else image.why_not()
+    if reason is not None:
+        raise UserError(reason)
     writable = [_made_folder(Path(name)) for name in args.results or [DEFAULT_RESULTS]]
-    outcome = session.run_in_guest(found, args.command, writable)
+    if args.hardware:
+        outcome = hardware.run_in_machine(args.command, writable)
+    else:
+        outcome = session.run_in_guest(image.find_image(), args.command, writable)
     if args.verbose:
         print(f"guest started in {outcome.boot_s:.1f} s", file=sys.stderr)
     return outcome.status

@@ -102,9 +102,9 @@ def _unpack(work: Path) -> Path:
     packages, root, new = work / "packages", work / "root", work / "new"
     for path in (packages, root, new / "modules", new / "can-utils"):
         path.mkdir(parents=True)
-    _run(["apt-get", "download", "-qq", *PACKAGES], packages)
+    run_apt(["apt-get", "download", "-qq", *PACKAGES], packages)
     for package in sorted(packages.glob("*.deb")):
-        _run(["dpkg-deb", "-x", str(package), str(root)], packages)
+        run_apt(["dpkg-deb", "-x", str(package), str(root)], packages)
     (root / "usr/bin/linux.uml").rename(new / "linux.uml")
     (root / "bin/busybox").rename(new / "busybox")
     for tool in CAN_TOOLS:
@@ -117,7 +117,8 @@ def _unpack(work: Path) -> Path:
     return new
 
 
-def _run(command: list[str], folder: Path) -> None:
+def run_apt(command: list[str], folder: Path) -> None:
+    """Run a program of apt or dpkg in a folder. Raises UserError with what it complained of."""
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
         said = [line.strip() for line in (done.stderr + done.stdout).splitlines() if line.startswith(("E:", "dpkg"))]
