@@ -138,7 +138,11 @@ def _boot(initramfs: Path, folder: Path, shared: Sequence[Path]) -> Outcome:
     begun_s = time.monotonic()
     boot_s = None
     process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=die_with_parent
+        command,
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=die_with_parent,  # noqa: PLW1509  no thread runs here
     )
     try:
         while process.poll() is None:
