@@ -75,7 +75,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     ids = ",".join(f"{m.frame_id:03X}" for m in DATABASE.messages if set(m.senders) & FED_NODES)
     done = subprocess.run(
         [*PARKCTL, "guest", "--results", str(folder), "--", sys.executable, "tests/vcan_session.py", str(folder), ids],
-        capture_output=True, text=True, cwd=ROOT, check=False, timeout=400,
+        capture_output=True, text=True, cwd=ROOT, check=False, timeout=480,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return Session(folder)
