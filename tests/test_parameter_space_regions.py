@@ -262,11 +262,11 @@ def test_a_boundary_that_does_not_exist_says_why():
     found = admissible_region([case_of("car", paper_plant(1.0), plane, DRegion(0.1))], plane)
     with pytest.raises(UserError, match=r"boundary IRB does not exist .* leading power is s\^5"):
         found.named("IRB")
-    with pytest.raises(UserError, match="boundary CRB d3 does not exist .* does not pass through the window"):
+    with pytest.raises(UserError, match=r"boundary CRB d3 does not exist .* does not pass through the window"):
         found.named("CRB d3")
     plane = plane_of("kp-kd", 0.5)
     found = admissible_region([case_of("car", paper_plant(1.0), plane, DRegion())], plane)
-    with pytest.raises(UserError, match="RRB d1 does not exist .* the gains have no effect there"):
+    with pytest.raises(UserError, match=r"RRB d1 does not exist .* the gains have no effect there"):
         found.named("RRB d1")
 
 

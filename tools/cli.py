@@ -18,10 +18,18 @@ COMMANDS = {
     "demo": ("tools.demo", "the whole test: car and controller as processes of their own, judged by the examiner"),
     "operate": ("tools.operator_station", "the operator station alone: start, stop, emergency stop, clear by keys"),
     "design": ("tools.design_cmd", "make or check the controller's tables from vehicle and course files"),
+    "parameter-space": (
+        "tools.design.parameter_space.command",
+        "the PID gains that keep all poles of a plant of your own in a region, with boundaries and page",
+    ),
     "paper": ("tools.paper.command", "the paper's tables and figures, ours beside the printed ones, on one page"),
     "deploy": (
         "tools.deploy.command",
         "what goes into the car: the wheel of the controller alone, with its systemd units",
+    ),
+    "campaign": (
+        "tools.campaign.command",
+        "Monte Carlo: thousands of tests with car, sensors and start not known before",
     ),
     "bench": ("tools.bench.command", "what the controller costs: jitter, tick, codec, turnaround, beside their floors"),
     "soak": ("tools.bench.soak", "many tests in a row with the same processes: frames, faults, memory, late cycles"),
@@ -36,7 +44,21 @@ PROCESSES = {
 }
 """Subcommand: (package that takes this process's place and has its own options, what it is for)."""
 
-ORDER = ("demo", "drive", "emulate", "operate", "preflight", "design", "paper", "deploy", "bench", "soak", "guest")
+ORDER = (
+    "demo",
+    "drive",
+    "emulate",
+    "operate",
+    "preflight",
+    "design",
+    "parameter-space",
+    "paper",
+    "campaign",
+    "deploy",
+    "bench",
+    "soak",
+    "guest",
+)
 
 STATUS_FAILED = 1
 STATUS_USER_ERROR = 2

@@ -275,8 +275,8 @@ def admissible_region(
 LEAST_LOOKED_AT = 1e-6
 LOOKED_AT = (3, 9)
 """Values a decade, first and, where nothing is found, then."""
-SMALL_GAINS = 12.0
-"""Where the least admissible gain is not about zero, the window ends at this many times it."""
+WHOLE, SMALL_GAINS = 60.0, 12.0
+"""A window ends at the greatest admissible gain if that is below WHOLE times the least, else at SMALL_GAINS times."""
 
 
 def _margins(cases: Iterable[Case], x: Floats, y: Floats) -> Floats:
@@ -365,7 +365,7 @@ def _span(values: Floats, unit: float, rough: tuple[float, float] | None = None)
     if rough is not None:
         reach = min(most, 1.3 * max(abs(rough[0]), abs(rough[1])))
     elif least > 10.0 * LEAST_LOOKED_AT * unit:
-        reach = min(most, SMALL_GAINS * least)
+        reach = most if most < WHOLE * least else SMALL_GAINS * least
     elif most > 0.1 * unit / LEAST_LOOKED_AT:
         reach = 2.0 * unit
     low, high = max(float(values.min()), -reach), min(float(values.max()), reach)

@@ -60,6 +60,7 @@ def explorer_page(
     windows: Mapping[str, Window] | None = None,
     points: Mapping[str, tuple[float, float]] | None = None,
     box: Mapping[str, tuple[float, float]] | None = None,
+    corners: Sequence[Mapping[str, float]] = (),
     pid: Pid = Pid(),  # noqa: B008 -- immutable
     delay_s: float = 0.0,
     cells: int = 61,
@@ -70,8 +71,8 @@ def explorer_page(
 ) -> str:
     """The page as one HTML text that needs nothing else; it opens at the middle of the speeds.
 
-    plant_at: called with a speed, and for each corner of `box` with its values as keywords; with a box it is called
-    without them too, for the nominal plant. For one plant: `lambda _: plant` with one speed. region: where the sliders
+    plant_at: called with a speed alone, for the nominal plant, and for each corner of `box` and each of `corners` with
+    its values as keywords. For one plant: `lambda _: plant` with one speed. region: where the sliders
     start; with `sigma_per_metre` its sigma counts per metre of travel (1/m), so that it scales with the speed. windows,
     points: by the plane's name; without them they are looked for at the first region. Raises UserError as
     `admissible_region` does, and where a plane is shown twice.
@@ -79,9 +80,10 @@ def explorer_page(
     if not planes or len(speeds_mps) < 1:
         raise UserError("explorer: at least one plane and one speed are needed")
     start = len(speeds_mps) // 2
+    every = [*_corners(box or {}), *corners]
     content: list[dict[str, Any]] = []
     for plane in planes:
-        loops = [_loops(plant_at, speed, plane, box, pid, delay_s) for speed in speeds_mps]
+        loops = [_loops(plant_at, speed, plane, every, pid, delay_s) for speed in speeds_mps]
         cases = [
             Case(name, loop, at_speed(region, speed, sigma_per_metre))
             for speed, named in zip(speeds_mps, loops, strict=True)
@@ -136,23 +138,24 @@ def at_speed(region: DRegion, speed_mps: float, sigma_per_metre: bool) -> DRegio
     return DRegion(sigma, region.zeta, region.radius_radps, region.zeta_within_radps)
 
 
+def _corners(box: Mapping[str, tuple[float, float]]) -> list[dict[str, float]]:
+    return [dict(zip(sorted(box), ends, strict=True)) for ends in product(*(box[name] for name in sorted(box))) if ends]
+
+
 def _loops(
     plant_at: Callable[..., Any],
     speed: float,
     plane: Plane,
-    box: Mapping[str, tuple[float, float]] | None,
+    corners: Sequence[Mapping[str, float]],
     pid: Pid,
     delay_s: float,
 ) -> list[tuple[str, Characteristic]]:
-    """The nominal loop first, then the corners of the box."""
-    found = [("nominal", characteristic(plant_of(plant_at(speed), delay_s=delay_s), plane, pid))]
-    names = sorted(box or {})
-    for ends in product(("low", "high"), repeat=len(names)):
-        if names:
-            values = {n: (box or {})[n][end == "high"] for n, end in zip(names, ends, strict=True)}
-            plant = plant_of(plant_at(speed, **values), delay_s=delay_s)
-            name = ", ".join(f"{n} {end}" for n, end in zip(names, ends, strict=True))
-            found.append((name, characteristic(plant, plane, pid)))
+    """The nominal loop first, then the corners."""
+    found = []
+    for values in ({}, *corners):
+        name = ", ".join(f"{key} = {value:g}" for key, value in values.items()) or "nominal"
+        plant = plant_of(plant_at(speed, **values), delay_s=delay_s, name=f"{speed:g}, {name}")
+        found.append((name, characteristic(plant, plane, pid)))
     return found
 
 
