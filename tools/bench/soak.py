@@ -175,8 +175,9 @@ class SoakRun(LiveRun):
     def _drive(self) -> str | None:
         station = self._station
         late = overruns = 0
-        waiting_s: float | None = time.monotonic()
-        began_s = blocked_s = None
+        waiting_s = time.monotonic()
+        began_s: float | None = None
+        blocked_s: float | None = None
         while len(self.tests) < self._runs:
             self._pump()
             now_s = time.monotonic()
@@ -196,7 +197,7 @@ class SoakRun(LiveRun):
                 began_s = now_s if station.mode == ACTIVE else None
                 blocked = station.mode == MANUAL and station.reason not in {*PASSING_REASONS, COMPLETE}
                 blocked_s = (blocked_s or now_s) if blocked else None
-                if now_s - (waiting_s or now_s) > START_LIMIT_S or now_s - (blocked_s or now_s) > BLOCKED_LIMIT_S:
+                if now_s - waiting_s > START_LIMIT_S or now_s - (blocked_s or now_s) > BLOCKED_LIMIT_S:
                     return f"test {len(self.tests) + 1}: the car did not start: {station.reason_text}"
             elif station.mode == MANUAL and station.reason == COMPLETE:
                 said = self._controller.latest
