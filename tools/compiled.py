@@ -50,6 +50,10 @@ PLANT_MODULES = (
 )
 
 
+OPTIONS: dict[str, Any] = {"_nrt": False}
+"""No counting of references: nothing here allocates, and counting those of the tables' arrays takes half of a run."""
+
+
 def compile_modules(*names: str) -> dict[str, ModuleType]:
     """Return clones of modules (dotted names) of pure functions with every function compiled (lazily) by numba.
 
@@ -67,7 +71,7 @@ def compile_modules(*names: str) -> dict[str, ModuleType]:
                 clone = FunctionType(
                     function.__code__, vars(clones[name]), function.__name__, function.__defaults__, None
                 )
-                compiled[function] = numba.njit(_nrt=False)(clone)
+                compiled[function] = numba.njit(**OPTIONS)(clone)
     for name, module in originals.items():
         for attribute, value in vars(module).items():
             if isinstance(value, FunctionType):
@@ -146,12 +150,12 @@ def cached_njit(function: Any, folder: Path | None) -> Any:
     import numba  # noqa: PLC0415
 
     if folder is None:
-        return numba.njit(_nrt=False)(function)
+        return numba.njit(**OPTIONS)(function)
     settings: Any = numba.config
     before = settings.CACHE_DIR
     try:
         settings.CACHE_DIR = str(folder)
-        return numba.njit(cache=True, _nrt=False)(function)
+        return numba.njit(cache=True, **OPTIONS)(function)
     finally:
         settings.CACHE_DIR = before
 

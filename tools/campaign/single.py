@@ -98,6 +98,12 @@ def compiled_drive() -> Callable[..., None]:
     return drive
 
 
+def is_compiled() -> bool:
+    """Return whether `compiled_drive` finds its work done on the disk."""
+    folder = cache_folder(MODULES)
+    return folder is not None and any(folder.rglob("*.nbi"))
+
+
 class Runner:
     """Drives runs with what they share; `compiled` decides by which of the two ways, with the same bits."""
 
