@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ from sim.data_files import Course, Vehicle, load_course, load_scenario, load_veh
 from sim.errors import UserError
 
 DONE, DIFFERENT = 0, 1
+TRADE_SEEDS = 4
+MOST_RUNS = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,6 +21,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--course", metavar="NAME|FILE", help="the course (default: ohio; with --update/--check: all)")
     parser.add_argument("--scenario", metavar="NAME|FILE", help="take this scenario's vehicle overlay into the design")
     parser.add_argument("--tables", type=Path, metavar="DIR", help="write the tables into this folder, replacing it")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="draw the design on one sheet: DIR/design.png, design.json"
+    )
+    parser.add_argument(
+        "--trade", type=Path, metavar="DIR",
+        help="the trade between clearance, steering, tracking and time: DIR/trade.png, trade.json (about 3 min)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--seeds", type=int, default=TRADE_SEEDS, metavar="N",
+        help="with --trade: runs of `car` in lock-step a path, 0 for none (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--finer", type=int, default=0, metavar="N",
+        help="with --trade: an independent search from N random starts for a clearer path still (about 1 s each)",
+    )  # fmt: skip
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--update", action="store_true", help="rewrite the tables that come with the project")
     what.add_argument("--check", action="store_true", help="make them again and compare; status 1 where they differ")
@@ -29,11 +47,20 @@ def run(options: argparse.Namespace) -> int:
     if options.update or options.check:
         if options.tables is not None or options.scenario is not None:
             raise UserError("--update and --check are for the shipped tables; leave out --tables and --scenario")
+        if options.out is not None or options.trade is not None:
+            raise UserError("--update and --check draw nothing; leave out --out and --trade")
         return _shipped(options)
+    for name in ("seeds", "finer"):
+        if not 0 <= getattr(options, name) <= MOST_RUNS:
+            raise UserError(f"--{name} {getattr(options, name)}: must be from 0 to {MOST_RUNS}")
     overlay = load_scenario(options.scenario).vehicle_overlay if options.scenario else None
     vehicle = load_vehicle(options.vehicle or "paper", overlay)
     course = load_course(options.course or "ohio")
-    figures = _design(vehicle, course, options.tables)
+    if options.trade is not None:
+        figures = _trade(vehicle, course, options)
+        _write_json(options.json, figures)
+        return DONE
+    figures = _design(vehicle, course, options.tables, options.out)
     _write_json(options.json, figures)
     return DONE if figures["certificate"]["all_d_stable"] else DIFFERENT
 
@@ -71,7 +98,7 @@ def _shipped(options: argparse.Namespace) -> int:
     return status
 
 
-def _design(vehicle: Vehicle, course: Course, folder: Path | None) -> dict[str, Any]:
+def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | None = None) -> dict[str, Any]:
     """Design, certify, show, and write where a folder is given; nothing is written where the certificate fails."""
     from tools.design import tables  # noqa: PLC0415 -- scipy
     from tools.design.certificate import certify  # noqa: PLC0415 -- python-control
@@ -80,6 +107,13 @@ def _design(vehicle: Vehicle, course: Course, folder: Path | None) -> dict[str, 
     certificate = certify(vehicle, report.gains)
     figures = tables.as_json(report, certificate)
     _show(figures)
+    if out is not None:
+        from tools.design import sheet  # noqa: PLC0415 -- matplotlib
+
+        _folder("--out", out)
+        sheet.draw(report, certificate, out / "design.png")
+        _write_json(out / "design.json", figures)
+        print(f"sheet in {out / 'design.png'}")
     if not certificate.all_d_stable:
         raise UserError(
             f"vehicle {vehicle.name}: the design is not stable in its whole box; worst: {certificate.worst}"
@@ -88,6 +122,88 @@ def _design(vehicle: Vehicle, course: Course, folder: Path | None) -> dict[str, 
         tables.write_tables(report, folder)
         print(f"tables written to {folder}")
     return figures
+
+
+def _folder(option: str, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{option} {folder}: no folder can be made there ({error.strerror})") from error
+
+
+def _trade(vehicle: Vehicle, course: Course, options: argparse.Namespace) -> dict[str, Any]:
+    """Compute, show and draw the trade curve; return its figures."""
+    from tools.design import finer, trade  # noqa: PLC0415 -- scipy
+    from tools.plots import trade as draw  # noqa: PLC0415 -- matplotlib
+
+    _folder("--trade", options.trade)
+    terminal = sys.stderr.isatty()
+
+    def tell(text: str) -> None:
+        print(f"\r\x1b[K{text}" if terminal else text, end="" if terminal else "\n", file=sys.stderr, flush=True)
+
+    seeds = list(range(options.seeds))
+    points = trade.trade_curve(vehicle, course, seeds, tell)
+    figures = trade.as_json(vehicle, course, points, seeds)
+    if options.finer:
+        tell(f"independent search from {options.finer} starts")
+        angle_rad = points[0].weights.angle_share * vehicle.max_road_wheel_angle_rad
+        best = finer.clearest(vehicle, course, angle_rad, starts=options.finer)
+        figures["finer"] = {
+            "starts": options.finer,
+            "min_clearance_m": best.clearance_m,
+            "more_than_the_curve_m": best.clearance_m - points[0].design.clearance_m,
+        }
+    if terminal:
+        tell("")
+    _show_trade(figures)
+    draw(
+        options.trade / "trade.png",
+        points=figures["points"],
+        title=f"trade curve: vehicle {vehicle.name} on course {course.name}; a point is a path, numbered as in the table",
+    )
+    _write_json(options.trade / "trade.json", figures)
+    print(f"curve in {options.trade / 'trade.png'}")
+    return figures
+
+
+def _show_trade(figures: dict[str, Any]) -> None:
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title=f"trade: {figures['vehicle']} on {figures['course']}", title_justify="left")
+    for name in (
+        "path",
+        "clearance m",
+        "body m",
+        "angle rad",
+        "slope rad/m",
+        "rate rad/s",
+        "leg s",
+        "max/rms mm",
+        "done",
+    ):
+        table.add_column(name, justify="right")
+    for number, point in enumerate(figures["points"], 1):
+        tracking = point["tracking"]
+        table.add_row(
+            f"{number}{' *' if point['chosen'] else '  '}",
+            f"{point['min_clearance_m']:.3f}",
+            f"{point['min_body_clearance_m']:.3f}",
+            f"{point['max_road_wheel_angle_rad']:.3f}",
+            f"{point['max_road_wheel_slope_radpm']:.3f}",
+            f"{point['max_road_wheel_rate_radps']:.3f}",
+            f"{point['leg_duration_s']:.2f}",
+            f"{1e3 * tracking['max_cross_track_m']:.1f}/{1e3 * tracking['rms_cross_track_m']:.2f}" if tracking else "-",
+            f"{tracking['completed']}/{tracking['runs']}" if tracking else "-",
+        )
+    console = Console()
+    console.print(table)
+    console.print("* the path that the tables take")
+    if "finer" in figures:
+        more = figures["finer"]["more_than_the_curve_m"]
+        found = figures["finer"]["min_clearance_m"]
+        console.print(f"independent search: {found:.4f} m, {1e3 * more:+.1f} mm against path 1")
 
 
 def _show(figures: dict[str, Any]) -> None:

@@ -1,0 +1,86 @@
+"""The design on one sheet: what a control engineer looks at before the car moves, as a picture."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tools.design import gains as criteria
+from tools.design import model
+from tools.design.certificate import Certificate, margins_of
+from tools.design.model import Row
+from tools.design.optimise import CHOSEN, max_road_wheel_slope
+from tools.design.speed_profile import road_wheel_slope
+from tools.design.tables import MAX_SPEED_MPS, DesignReport, speed_limits
+
+LAW = "car"
+RESOLUTION = 300
+"""Frequencies a loop is computed at for the curves; the certificate takes more."""
+
+
+def margins_over_speed(report: DesignReport) -> list[dict[str, Any]]:
+    """Return disk and delay margin over the speeds of the gain table, each of the worst car, an entry a direction."""
+    nominal = model.nominal_of(report.vehicle)
+    cars = criteria.corners(report.vehicle)
+    top_mps = criteria.checked_speeds(report.vehicle)[-1]
+    found = []
+    for direction, name in ((1.0, "forward"), (-1.0, "reverse")):
+        entry: dict[str, Any] = {"direction": name, "speed_mps": [], "disk": [], "delay_samples": []}
+        for row in (Row(*values) for values in report.gains[LAW]):
+            if row.direction != direction or not 0.0 < row.speed_mps <= top_mps:
+                continue
+            omega = criteria.frequencies(row.speed_mps, RESOLUTION)
+            predicts = LAW in criteria.PREDICTING_LAWS
+            loops = model.loop_response(row, nominal, cars, criteria.on_circle(omega), predicts)
+            margins = [margins_of(loop, omega) for loop in loops]
+            entry["speed_mps"].append(row.speed_mps)
+            entry["disk"].append(min(margin.disk for margin in margins))
+            entry["delay_samples"].append(min(margin.delay_samples for margin in margins))
+        found.append(entry)
+    return found
+
+
+def draw(report: DesignReport, certificate: Certificate, file: Path) -> None:
+    """Draw the sheet."""
+    from tools.plots import design_sheet  # noqa: PLC0415 -- matplotlib
+
+    vehicle, design = report.vehicle, report.design
+    path, limits = design.path, speed_limits(vehicle)
+    slope = road_wheel_slope(path, vehicle.wheelbase_m)
+    facts = [
+        f"path length            {path.length_m:.2f} m",
+        f"clearance, with mirrors {design.clearance_m:.3f} m ({design.nearest_cone})",
+        f"clearance, body alone  {design.body_clearance_m:.3f} m",
+        f"road-wheel angle       {design.max_road_wheel_angle_rad:.3f} of {vehicle.max_road_wheel_angle_rad:.3f} rad",
+        f"steering slope         {max_road_wheel_slope(design, vehicle.wheelbase_m):.3f} rad/m",
+        f"curvature, its slope   {np.abs(path.curvature_1pm).max():.4f} 1/m, "
+        f"{np.abs(path.curvature_slope_1pm2).max():.4f} 1/m²",
+        f"legs                   {report.profiles[0].duration_s:.2f} s, {report.profiles[1].duration_s:.2f} s",
+        "",
+        f"disk margin            {certificate.min_disk_margin:.2f}",
+        f"delay margin           {certificate.min_delay_margin_samples:.1f} samples",
+        f"gain, phase margin     {certificate.min_gain_margin:.2f}, "
+        f"{math.degrees(certificate.min_phase_margin_rad):.0f} deg",
+        f"poles in the D-region  {'all' if certificate.all_d_stable else 'NOT ALL'}",
+        "worst car, law and speed:",
+        *(f"  {part}" for part in certificate.worst.split(", ")),
+    ]
+    design_sheet(
+        file,
+        vehicle=vehicle,
+        course=report.course,
+        path=path,
+        profiles=report.profiles,
+        steering={"angle_rad": np.arctan(vehicle.wheelbase_m * path.curvature_1pm), "slope_radpm": slope},
+        margins=margins_over_speed(report),
+        limits={
+            "angle_rad": vehicle.max_road_wheel_angle_rad,
+            "planned_angle_rad": CHOSEN.angle_share * vehicle.max_road_wheel_angle_rad,
+            "rate_radps": vehicle.max_road_wheel_rate_radps,
+            "planned_rate_radps": limits.road_wheel_rate_radps,
+            "speed_mps": min(MAX_SPEED_MPS, vehicle.max_speed_mps),
+        },
+        facts=facts,
+        title=f"vehicle {vehicle.name} on course {report.course.name}: {vehicle.description}",
+    )
