@@ -160,7 +160,7 @@ def _trade(vehicle: Vehicle, course: Course, options: argparse.Namespace) -> dic
     draw(
         options.trade / "trade.png",
         points=figures["points"],
-        title=f"trade curve: vehicle {vehicle.name} on course {course.name}; a point is a path, numbered as in the table",
+        title=f"trade curve: vehicle {vehicle.name} on course {course.name}; a point is a path, as in the table",
     )
     _write_json(options.trade / "trade.json", figures)
     print(f"curve in {options.trade / 'trade.png'}")
@@ -172,18 +172,9 @@ def _show_trade(figures: dict[str, Any]) -> None:
     from rich.table import Table  # noqa: PLC0415
 
     table = Table(title=f"trade: {figures['vehicle']} on {figures['course']}", title_justify="left")
-    for name in (
-        "path",
-        "clearance m",
-        "body m",
-        "angle rad",
-        "slope rad/m",
-        "rate rad/s",
-        "leg s",
-        "max/rms mm",
-        "done",
-    ):
-        table.add_column(name, justify="right")
+    units = {"room": "m", "body": "m", "angle": "rad", "slope": "rad/m", "rate": "rad/s", "leg": "s", "max/rms": "mm"}
+    for name in ("path", *units, "done"):
+        table.add_column(f"{name}\n{units.get(name, '')}", justify="right", no_wrap=True)
     for number, point in enumerate(figures["points"], 1):
         tracking = point["tracking"]
         table.add_row(
