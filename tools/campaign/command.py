@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import base64
 import hashlib
 import json
 import os
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -149,8 +151,8 @@ def _check_out(file: Path) -> None:
         raise UserError(f"--out {file}: a campaign was begun there; go on with --resume {file}, or name another file")
 
 
-def _prepare(given: dict[str, Any], runs: int, stack: ExitStack) -> Campaign:
-    """Load and check all files, design tables where none are shipped."""
+def _prepare(given: dict[str, Any], runs: int, stack: ExitStack, kept: dict[str, str] | None = None) -> Campaign:
+    """Load and check all files, design tables where none are shipped; `kept` are those of a campaign begun before."""
     from sim.data_files import check_fit, load_course, load_scenario, load_vehicle  # noqa: PLC0415
     from tools.campaign import work  # noqa: PLC0415
     from tools.campaign.draws import TABLE  # noqa: PLC0415
@@ -163,10 +165,15 @@ def _prepare(given: dict[str, Any], runs: int, stack: ExitStack) -> Campaign:
     vehicle = load_vehicle(given["vehicle"], scenario.vehicle_overlay)
     course = load_course(given["course"])
     check_fit(vehicle, course)
-    tables = Path(given["tables"]) if given["tables"] else _tables(vehicle, course, stack)
+    if kept is not None:
+        tables = _unpack_tables(kept, stack)
+    elif given["tables"]:
+        tables = Path(given["tables"])
+    else:
+        tables = _tables(vehicle, course, stack)
     shared = share(vehicle, course, given["law"], tables)
-    job = work.Job(shared, scenario, given["seed"], runs, work.CHUNK_RUNS, work.code_digest())
-    tables_text = b"".join(file.read_bytes() for file in sorted(tables.glob("*")) if file.is_file())
+    job = work.Job(shared, scenario, given["seed"], runs, work.chunk_runs_of(runs), work.code_digest())
+    tables_text = {file.name: file.read_bytes() for file in sorted(tables.iterdir()) if file.is_file()}
     about = {
         **given,
         "vehicle": str(given["vehicle"]),
@@ -178,13 +185,22 @@ def _prepare(given: dict[str, Any], runs: int, stack: ExitStack) -> Campaign:
             "vehicle": _digest(vehicle.file_bytes),
             "course": _digest(course.model_dump_json().encode()),
             "scenario": _digest(scenario.model_dump_json().encode()),
-            "tables": _digest(tables_text),
+            "tables": _digest(b"".join(tables_text.values())),
             "dbc": _digest(DBC.read_bytes()),
             "code": job.code,
         },
         "draws": [list(line) for line in TABLE],
+        "tables_zlib": {name: base64.b64encode(zlib.compress(text)).decode() for name, text in tables_text.items()},
     }
     return Campaign(vehicle, course, scenario, given["law"], tables, job, about)
+
+
+def _unpack_tables(kept: dict[str, str], stack: ExitStack) -> Path:
+    """Write the tables that a campaign carries with it into a temporary folder."""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="parkctl-tables-")))
+    for name, text in kept.items():
+        (folder / Path(name).name).write_bytes(zlib.decompress(base64.b64decode(text)))
+    return folder
 
 
 def _digest(content: bytes) -> str:
@@ -242,7 +258,8 @@ def _same_options(args: argparse.Namespace, about: dict[str, Any], file: Path) -
 
 def _again(about: dict[str, Any], file: Path, stack: ExitStack) -> Campaign:
     """Load the campaign that a journal or file tells of. Raises UserError where it is no longer the same."""
-    campaign = _prepare({name: about[name] for name in DEFAULTS}, about["runs"], stack)
+    given = {name: about[name] for name in DEFAULTS}
+    campaign = _prepare(given, about["runs"], stack, about["tables_zlib"])
     job = campaign.job._replace(chunk_runs=about["chunk_runs"])
     for what, digest in campaign.about["digest"].items():
         if digest != about["digest"][what]:
@@ -267,27 +284,26 @@ def _drive(campaign: Campaign, file: Path, journal: Any, args: argparse.Namespac
     known = {} if journal is None else journal.done
     missing = [chunk for chunk in range(chunks) if chunk not in known]
     begun_s = time.monotonic()
-    source = _source(job, missing, args.scheduler, workers)
-    first: tuple[int, Rows] | None
+    is_new = journal is None
     if journal is None:
-        first = next(source)  # whatever is wrong with workers or cluster comes out before a file is made
         journal = Journal.begin(journal_of(file), campaign.about)
-    else:
-        first = next(source, None)
     done = sum(len(rows) for rows in journal.done.values())
     fresh = 0
     clearance = COLUMNS.index("min_clearance_m")
     worst = min((float(rows[:, clearance].min()) for rows in journal.done.values()), default=float("inf"))
     progress = CountProgress("campaign", "runs", job.runs, done)
     progress.show(begun_s, done)
+    source = _source(job, missing, args.scheduler, workers)
     try:
-        while first is not None:
-            chunk, rows = first
+        for chunk, rows in source:
             journal.append(chunk, rows)
             fresh += len(rows)
             worst = min(worst, float(rows[:, clearance].min()))
             progress.show(time.monotonic(), done + fresh, f"worst clearance {worst:.3f} m")
-            first = next(source, None)
+    except UserError:
+        if is_new and not fresh:  # wrong from the start, as a cluster's address may be: nothing to go on with
+            journal.path.unlink(missing_ok=True)
+        raise
     except KeyboardInterrupt:
         progress.close()
         print(f"parkctl: {done + fresh} runs are kept; go on with: parkctl campaign --resume {file}", file=sys.stderr)

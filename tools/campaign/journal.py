@@ -25,6 +25,7 @@ from tools.campaign.results import COLUMNS, Rows
 MAGIC = b"RUN1"
 HEAD = struct.Struct("<4sIII")
 FORMAT = 1
+LONGEST_LINE = 1 << 26
 
 
 def journal_of(file: Path) -> Path:
@@ -105,7 +106,7 @@ def _lock(file: Any, path: Path) -> None:
 
 def _about(file: Any, path: Path) -> dict[str, Any]:
     try:
-        about = json.loads(file.readline(1 << 20))
+        about = json.loads(file.readline(LONGEST_LINE))
         known = about["format"] == FORMAT and about["columns"] == list(COLUMNS)
     except (ValueError, TypeError, KeyError):
         raise UserError(f"{path}: not the journal of a campaign") from None

@@ -57,6 +57,13 @@ class Outcome(NamedTuple):
     trace: Any
 
 
+def failed_outcome(reason: float) -> Outcome:
+    """Return the outcome of a run that came to nothing, for a reason by the DBC's control_reason; it has no cycles."""
+    end = [0.0] * END_SLOTS
+    end[manoeuvre.REASON] = reason
+    return Outcome([0.0] * (LEG_FIGURES * ERRORS_A_LEG), end, begin_notes(), None)
+
+
 def share(vehicle: Vehicle, course: Course, law: str, tables_dir: FilePath, dbc: FilePath = DBC) -> Shared:
     """Load what a campaign needs. The vehicle carries the scenario's overlay already."""
     if len(course.cones) > MOST_CONES:

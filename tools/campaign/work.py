@@ -19,17 +19,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from firmware_py.core.conditions import INTERNAL_ERROR
 from sim.data_files import Scenario
 from sim.errors import UserError
 from tools.campaign.draws import DRAWN_FROM_BOX, draw
 from tools.campaign.results import Rows, row_of
-from tools.campaign.single import MODULES, Runner, Shared
+from tools.campaign.single import MODULES, Runner, Shared, failed_outcome
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
 CHUNK_RUNS = 25
 """Runs of a chunk: about a quarter of a second, so that a kill loses little and appending costs nothing."""
+
+LEAST_CHUNKS = 16
+"""Small campaigns are cut finer than that."""
 
 WAITING_A_WORKER = 3
 """Chunks that lie ready for each worker."""
@@ -53,6 +57,11 @@ class Job(NamedTuple):
         return -(-self.runs // self.chunk_runs)
 
 
+def chunk_runs_of(runs: int) -> int:
+    """Return how many runs make a chunk; it does not depend on who drives them."""
+    return max(1, min(CHUNK_RUNS, runs // LEAST_CHUNKS))
+
+
 def code_digest() -> str:
     """Return a hash of the source of all that a run goes through."""
     import importlib  # noqa: PLC0415
@@ -73,7 +82,11 @@ def drive_chunk(job: Job, runner: Runner, chunk: int) -> Rows:
     rows = []
     for run in range(first, min(first + job.chunk_runs, job.runs)):
         drawn = draw(vehicle, job.scenario, job.first_seed + run)
-        rows.append(row_of(run, drawn, runner.run(drawn.scenario, drawn.side, drawn.seed), nominal))
+        try:
+            outcome = runner.run(drawn.scenario, drawn.side, drawn.seed)
+        except (ArithmeticError, ValueError):  # what stops the car in the live loop must not stop the campaign
+            outcome = failed_outcome(float(INTERNAL_ERROR))
+        rows.append(row_of(run, drawn, outcome, nominal))
     return np.array(rows, dtype=np.float64)
 
 
