@@ -1,12 +1,12 @@
 """The certificate of a set of gains: stability margins of the whole steering loop over every car that may come true.
 
-Every law, direction, speed of the gain table and middle between two speeds, each with the nominal car and all corners
-of the vehicle's box (`tools.design.gains.corners`). Margins are those of the loop cut at the steering command.
+Every direction, speed of the gain table and middle between two speeds, each with the nominal car and all corners of the
+vehicle's box (`tools.design.gains.corners`). Margins are those of the loop cut at the steering command.
 """
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,11 +20,14 @@ RESOLUTION = 600
 
 
 class Certificate(NamedTuple):
-    """The smallest margins of all loops, and where the disk margin is smallest.
+    """The smallest margins of all loops of the law `car`, and where the disk margin is smallest.
 
     Delay in samples of 10 ms beyond the car's own; gain as the factor, up or down, that ends stability; the disk margin
     is the balanced one (any mixture of gain and phase). A loop that is not stable has margins of 0 (gain: 1). D-stable:
     every pole of every loop is in the D-region of `tools.design.gains`.
+
+    `others` holds the same figures for what is not the usual: the law without the yaw rate, and the other laws.
+    `by_speed` has the smallest disk margin and delay margin of each (direction, speed in m/s).
     """
 
     min_delay_margin_samples: float
@@ -33,6 +36,8 @@ class Certificate(NamedTuple):
     min_phase_margin_rad: float
     all_d_stable: bool
     worst: str
+    others: dict[str, dict[str, Any]]
+    by_speed: list[tuple[float, float, float, float]]
 
 
 class Margins(NamedTuple):
@@ -49,22 +54,47 @@ UNSTABLE = Margins(0.0, 0.0, 1.0, 0.0)
 
 def certify(vehicle: Vehicle, gains: dict[str, list[tuple[float, ...]]]) -> Certificate:
     """Certify gain tables (`tools.design.gains.design_gains`) for a vehicle."""
+    usual: Certificate | None = None
+    others: dict[str, dict[str, Any]] = {}
+    for law, rows in gains.items():
+        for mode in criteria.MODES[law]:
+            found = _certify(vehicle, rows, mode)
+            if usual is None:
+                usual = found
+                continue
+            figures = found._asdict()
+            del figures["others"], figures["by_speed"]
+            others[_name_of(law, mode)] = figures
+    assert usual is not None
+    return usual._replace(others=others, all_d_stable=usual.all_d_stable and all(o["all_d_stable"] for o in others.values()))
+
+
+def _name_of(law: str, mode: model.Mode) -> str:
+    return law if mode == criteria.MODES[law][0] else f"{law}, without the yaw rate"
+
+
+def _certify(vehicle: Vehicle, rows: list[tuple[float, ...]], mode: model.Mode) -> Certificate:
     nominal = model.nominal_of(vehicle)
     cars = criteria.corners(vehicle)
     top_mps = criteria.checked_speeds(vehicle)[-1]
     found: list[tuple[Margins, str]] = []
+    by_speed = []
     all_d_stable = True
-    for law, rows in gains.items():
-        for row in _rows(rows, top_mps):
-            where = f"law {law}, direction {row.direction:+.0f}, {row.speed_mps:g} m/s"
-            predicts = law in criteria.PREDICTING_LAWS
-            omega = criteria.frequencies(row.speed_mps, RESOLUTION)
-            loops = model.loop_response(row, nominal, cars, criteria.on_circle(omega), predicts)
-            for car, loop in zip(cars, loops, strict=True):
-                matrix = model.closed_loop(row, nominal, car, predicts)
-                stable = model.is_stable(matrix)
-                all_d_stable = all_d_stable and stable and criteria.d_stable(matrix, row.speed_mps)
-                found.append((margins_of(loop, omega) if stable else UNSTABLE, f"{where}, {car.name}"))
+    for row in _rows(rows, top_mps):
+        where = f"direction {row.direction:+.0f}, {row.speed_mps:g} m/s"
+        omega = criteria.frequencies(row.speed_mps, RESOLUTION)
+        law = model.controller(row, nominal, mode)
+        loops = model.loop_response(law, row, cars, criteria.on_circle(omega))
+        here = []
+        for car, loop in zip(cars, loops, strict=True):
+            matrix = model.closed_loop(law, model.car(car, row.speed_mps, row.direction))
+            stable = model.is_stable(matrix)
+            all_d_stable = all_d_stable and stable and criteria.d_stable(matrix, row.speed_mps)
+            here.append((margins_of(loop, omega) if stable else UNSTABLE, f"{where}, {car.name}"))
+        found += here
+        by_speed.append(
+            (row.direction, row.speed_mps, min(m.disk for m, _ in here), min(m.delay_samples for m, _ in here))
+        )
     return Certificate(
         min_delay_margin_samples=min(margins.delay_samples for margins, _ in found),
         min_disk_margin=min(margins.disk for margins, _ in found),
@@ -72,6 +102,8 @@ def certify(vehicle: Vehicle, gains: dict[str, list[tuple[float, ...]]]) -> Cert
         min_phase_margin_rad=min(margins.phase_rad for margins, _ in found),
         all_d_stable=all_d_stable,
         worst=min(found, key=lambda item: item[0].disk)[1],
+        others={},
+        by_speed=by_speed,
     )
 
 
