@@ -131,7 +131,6 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         inputs.position.position_x_m,
         inputs.position.position_y_m,
         inputs.attitude.yaw_rad,
-        active,
         car.pose_latency_samples if tables.uses_predictor != 0 else 0,
     )
     station_m, cross_m, heading_rad = predictor.predict(

@@ -95,9 +95,9 @@ class EstimatorState(NamedTuple):
 class Motion(NamedTuple):
     """What one cycle tells of the car's motion.
 
-    `odometry_m` is the way along the leg's travel as the odometry has it, `acted_angle_rad` the command that acts on the nominal actuator
-    now. `*_is_fresh` is 0 where a value is not of this cycle or not valid; `standstill` is 1 for a car that stands;
-    `follows` is 1 while the vehicle follows the commands.
+    `odometry_m` is the way along the leg's travel as the odometry has it, `acted_angle_rad` the command that acts on
+    the nominal actuator now. `*_is_fresh` is 0 where a value is not of this cycle or not valid; `standstill` is 1 for a
+    car that stands; `follows` is 1 while the vehicle follows the commands.
     """
 
     odometry_m: float
@@ -148,12 +148,11 @@ def estimate(
     position_x_m: float,
     position_y_m: float,
     yaw_rad: float,
-    active: bool,
     pose_latency_samples: int,
 ) -> EstimatorState:
     """Return the state one cycle later: carried on by the car's motion, corrected if a pose arrived.
 
-    While `active` a pose beyond the gate is not believed; before, at standstill, it begins a new average.
+    While the vehicle follows, a pose beyond the gate is not believed; else, at standstill, it begins a new average.
     """
     (
         x_m,
@@ -177,7 +176,9 @@ def estimate(
         odometry_y_m,
         odometry_yaw_rad,
     ) = state
-    odometry_m, dt_s, acted_rad, meas_rad, angle_is_fresh, yaw_rate_radps, yaw_rate_is_fresh, standstill, follows = motion
+    odometry_m, dt_s, acted_rad, meas_rad, angle_is_fresh, yaw_rate_radps, yaw_rate_is_fresh, standstill, follows = (
+        motion
+    )
     sigma = leg.sigma
 
     # The wheels: measured, or as the nominal actuator has them.
@@ -236,6 +237,8 @@ def estimate(
     odometry_yaw_rad = (odometry_yaw_rad[0] + turn_rad, *odometry_yaw_rad[:-1])
     if yaw_rate_is_fresh != 0:
         last_yaw_rate_radps = yaw_rate_radps
+    elif dt_s > 0.0:
+        last_yaw_rate_radps = turn_rad / dt_s + bias_radps
 
     # The estimate relative to the path.
     dx_m = x_m - path_x_m
@@ -260,7 +263,7 @@ def estimate(
         along_m = 0.0
         left_m = 0.0
         turned_rad = 0.0
-        if standstill != 0 and (believed or not active):
+        if standstill != 0 and (believed or follows == 0):
             if not believed:
                 averaged = 0
             averaged = min(averaged + 1, AVERAGING_MAX)

@@ -49,7 +49,7 @@ HEADING_WALK = 0.2e-3
 """With the yaw rate: what the rear tyres' unknown slip moves the car aside (m), and what is left of heading that the
 yaw rate does not show (rad), per root metre of travel."""
 
-ROAD_WALK_1PM = 0.7e-3
+ROAD_WALK_1PM = 0.5e-3
 """Change of the road disturbance per root metre: the play of the steering goes from one side to the other."""
 
 OFFSET_LENGTH_M = 2.0
@@ -72,8 +72,8 @@ saturates the steering's rate, which no linear margin shows: twice this pace los
 SLOWEST_PACE = 0.3
 """Below it a start off the path would not be corrected within a leg."""
 
-LEAST_DISK_MARGIN = {"car": 0.52, "pid_ff": 0.34}
-"""Of every car in the box: 0.52 is 1.7 times the steering gain or 29 degrees of phase, whatever mixture of both."""
+LEAST_DISK_MARGIN = {"car": 0.6, "pid_ff": 0.34}
+"""Of every car in the box: 0.6 is 1.86 times the steering gain or 33 degrees of phase, whatever mixture of both."""
 
 LEAST_DISK_MARGIN_WITHOUT_YAW_RATE = 0.34
 """For the rest of a run in which the yaw rate has gone missing: 1.4 times the gain or 19 degrees."""
@@ -111,11 +111,11 @@ def checked_speeds(vehicle: Vehicle) -> tuple[float, ...]:
     return SPEED_GRID_MPS[1 : len(reached) + 1]
 
 
-def corners(vehicle: Vehicle, tyres: bool = True) -> list[model.Corner]:
+def corners(vehicle: Vehicle, softest_tyres: bool = False) -> list[model.Corner]:
     """The cars to survive: the nominal one, then the corners of the box.
 
-    In steering lag, latencies, steering gain and wheelbase; with `tyres` also in mass (with the yaw inertia) and in
-    cornering stiffness (both axles together), which hardly matter at walking speed.
+    In steering lag, latencies, steering gain, wheelbase, mass (with the yaw inertia) and cornering stiffness (both
+    axles together). With `softest_tyres` only those with the greatest mass on the softest tyres, which answer last.
     """
     nominal = model.Corner(
         "nominal car",
@@ -133,9 +133,9 @@ def corners(vehicle: Vehicle, tyres: bool = True) -> list[model.Corner]:
     cars = [nominal]
     box = vehicle.box
 
-    def shares(key: str) -> tuple[float, ...]:
-        own = getattr(vehicle, key)
-        return tuple(end / own for end in _ends(box[key])) if tyres else (1.0,)
+    def shares(key: str, softest: int) -> tuple[float, ...]:
+        both = tuple(end / getattr(vehicle, key) for end in _ends(box[key]))
+        return both[softest : softest + 1] or both if softest_tyres else both
 
     for lag, pose, command, gain, wheelbase, mass, stiffness in itertools.product(
         _ends(box["steering_lag_s"]),
@@ -143,12 +143,13 @@ def corners(vehicle: Vehicle, tyres: bool = True) -> list[model.Corner]:
         _ends(box["command_latency_samples"]),
         (1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD),
         _ends(box["wheelbase_m"]),
-        shares("mass_kg"),
-        shares("cornering_stiffness_front_n_per_rad"),
+        shares("mass_kg", 1),
+        shares("cornering_stiffness_front_n_per_rad", 0),
     ):
-        name = f"lag {lag:g} s, latency {pose:g} + {command:g} samples, steering gain {gain:g}, wheelbase {wheelbase:g} m"
-        if tyres:
-            name += f", mass {mass:.2g} and stiffness {stiffness:.2g} of nominal"
+        name = (
+            f"lag {lag:g} s, latency {pose:g} + {command:g} samples, steering gain {gain:g}, wheelbase {wheelbase:g} m,"
+            f" mass {mass:.2g} and stiffness {stiffness:.2g} of nominal"
+        )
         cars.append(
             nominal._replace(
                 name=name,
@@ -206,7 +207,7 @@ def gyro_model(direction: float, speed_mps: float) -> tuple[Floats, Floats]:
 
 
 def steering_model(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> tuple[Floats, Floats]:
-    """The estimator without the yaw rate: F and process noise of (cross-track error, heading error, road disturbance)."""
+    """The estimator without it: F and process noise of (cross-track error, heading error, road disturbance)."""
     ds = speed_mps * model.PERIOD_S
     turn = direction * ds
     f = np.array([[1.0, turn, 0.5 * ds * ds], [0.0, 1.0, turn], [0.0, 0.0, 1.0]])
@@ -252,16 +253,17 @@ def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observ
         without = steering_gains(direction, speed_mps, observer_noise(observer_pace))
         road = road_gain(direction, speed_mps)
         offset = 1.0 - math.exp(-speed_mps * model.PERIOD_S / OFFSET_LENGTH_M)
-    return Row(
+    numbers = (
         direction,
         speed_mps,
         PREVIEW_S * speed_mps,
         *pid_gains(pid_pace),
         offset,
-        *(float(value) for value in with_yaw_rate.reshape(-1)),
+        *with_yaw_rate.reshape(-1),
         road,
-        *(float(value) for value in without.reshape(-1)),
+        *without.reshape(-1),
     )
+    return Row._make(float(number) for number in numbers)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -330,8 +332,8 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
     return tables
 
 
-class _Speed(NamedTuple):
-    """The cars of a vehicle's box at one speed: their answers at the frequencies, and their matrices."""
+class CarsAtSpeed(NamedTuple):
+    """The cars of a vehicle's box at one speed: their answers at the points z, and their matrices."""
 
     cars: Sequence[model.Corner]
     z: Complexes
@@ -339,22 +341,22 @@ class _Speed(NamedTuple):
     plants: Sequence[model.StateSpace]
 
 
-def _at_speed(cars: Sequence[model.Corner], speed_mps: float) -> _Speed:
-    z = on_circle(frequencies(speed_mps))
-    return _Speed(
+def cars_at_speed(cars: Sequence[model.Corner], speed_mps: float, direction: float, z: Complexes) -> CarsAtSpeed:
+    """Return the cars at a speed and direction; what all laws and modes have in common."""
+    return CarsAtSpeed(
         cars,
         z,
-        np.stack([model.car_response(car, speed_mps, 1.0, z) for car in cars]),
-        [model.car(car, speed_mps, 1.0) for car in cars],
+        np.stack([model.car_response(car, speed_mps, direction, z) for car in cars]),
+        [model.car(car, speed_mps, direction) for car in cars],
     )
 
 
 def choose(vehicle: Vehicle, law: str) -> Schedule:
     """The quickest schedule of a vehicle and law whose cars all survive; UserError where there is none."""
     nominal = model.nominal_of(vehicle)
-    cars = corners(vehicle, tyres=False)
+    cars = corners(vehicle, softest_tyres=True)
     checked = checked_speeds(vehicle)
-    at = {speed: _at_speed(cars, speed) for speed in checked}
+    at = {speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked}
     usual, *others = MODES[law]
     paces: list[float] = []
     # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
@@ -392,10 +394,9 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
     return Schedule(observer_pace, (paces[0], *paces, *(paces[-1],) * beyond))
 
 
-def _survives(row: Row, nominal: model.Nominal, mode: Mode, at: _Speed, least_disk_margin: float) -> bool:
+def _survives(row: Row, nominal: model.Nominal, mode: Mode, at: CarsAtSpeed, least_disk_margin: float) -> bool:
     law = model.controller(row, nominal, mode)
-    answer = model.response(law, at.z)[:, 0, :]
-    if float(disk_margin(-np.sum(answer * at.answers, axis=2)).min()) < least_disk_margin:
+    if float(disk_margin(model.loops(law, at.answers, at.z)).min()) < least_disk_margin:
         return False
     least_damping = BLEND_RESERVE * LEAST_DAMPING
     return all(d_stable(model.closed_loop(law, plant), row.speed_mps, least_damping) for plant in at.plants)
@@ -428,7 +429,7 @@ def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
             return 0.0
         return float(disk_margin(model.loop_response(system, row, [car], z))[0])
 
-    cars = corners(vehicle, tyres=False)
+    cars = corners(vehicle, softest_tyres=True)
     worst = min(cars, key=margin)
     # The dimension that helps most when it alone is nominal; where none helps enough, when it alone does not delay.
     blamed = _dimension_that_helps(worst, cars[0], margin)

@@ -37,7 +37,7 @@ LEAST_LAG_S = 1e-3
 """A steering quicker than this is taken to have this lag."""
 
 OUTPUTS = 4
-"""Of the car: cross-track error (m) and heading (rad) of the pose, yaw rate (rad/s), measured road-wheel angle (rad)."""
+"""Of the car: cross-track error (m) and heading (rad) of the pose, yaw rate (rad/s), measured angle (rad)."""
 
 
 class Row(NamedTuple):
@@ -201,7 +201,6 @@ def car_response(corner: Corner, speed_mps: float, direction: float, z: Complexe
     """Frequency response of `car` at the points z, shape (len(z), OUTPUTS)."""
     sampled = _sampled(corner, direction * speed_mps)
     drive = (sampled.newer + np.outer(1.0 / z, sampled.older)) * (z**-sampled.whole)[:, None]
-    # The angle leads the rest: solved for by itself, the place and yaw behind them by hand, the two in between by Cramer.
     state = np.linalg.solve(z[:, None, None] * np.eye(5) - sampled.a, drive[:, :, None])[:, :, 0]
     late = z**-corner.pose_latency_samples
     return np.stack([late * state[:, 0], late * state[:, 1], state[:, 3], state[:, 4]], axis=1)
@@ -317,7 +316,6 @@ class _Cycle:
             _STATION_M + (body_m if n == 0 else 0.0),
             float(report[0]),
             float(report[1]),
-            True,
             n,
         )
         assert seen.disbelieved == 0
@@ -365,11 +363,7 @@ def controller(row: Row, nominal: Nominal, mode: Mode = Mode()) -> StateSpace:  
         columns[:size, index] = (ahead - behind) / (2.0 * _TINY)
         columns[size, index] = (command - command_behind) / (2.0 * _TINY)
     columns[np.abs(columns) < 1e-13] = 0.0
-    idle = [
-        index
-        for index in range(size)
-        if columns[index, index] == 1.0 and np.count_nonzero(columns[index]) == 1
-    ]
+    idle = [index for index in range(size) if columns[index, index] == 1.0 and np.count_nonzero(columns[index]) == 1]
     keep = [index for index in range(size) if index not in idle]
     return StateSpace(
         columns[np.ix_(keep, keep)],
@@ -413,12 +407,14 @@ def closed_loop(law: StateSpace, plant: StateSpace) -> Floats:
     return np.asarray(loop.a - loop.b @ loop.c)
 
 
+def loops(law: StateSpace, answers: Complexes, z: Complexes) -> Complexes:
+    """L of `open_loop` at the points z, shape (cars, len(z)), for cars whose `car_response` is given."""
+    return np.asarray(-np.sum(response(law, z)[:, 0, :] * answers, axis=-1))
+
+
 def loop_response(law: StateSpace, row: Row, corners: Sequence[Corner], z: Complexes) -> Complexes:
-    """L of `open_loop` at the points z for several cars under one controller, shape (len(corners), len(z))."""
-    answer = response(law, z)[:, 0, :]
-    return np.stack(
-        [-np.sum(answer * car_response(corner, row.speed_mps, row.direction, z), axis=1) for corner in corners]
-    )
+    """The same for several cars under one controller, shape (len(corners), len(z))."""
+    return loops(law, np.stack([car_response(corner, row.speed_mps, row.direction, z) for corner in corners]), z)
 
 
 def is_stable(matrix: Floats) -> bool:
