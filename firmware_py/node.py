@@ -131,7 +131,7 @@ class ControllerNode:
 
     def seen(self) -> Seen:
         """Return mode, leg, reason and place as the newest cycle left them."""
-        path = self._state.observer.path
+        path = self._state.estimator
         sys = self._outputs.sys if self._outputs else SysCommand(0, 0, 0, 0, c.WAITING_FOR_REPORTS)
         return Seen(
             mode=sys.control_mode,

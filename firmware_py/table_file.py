@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from firmware_py.core import predictor
+from firmware_py.core import estimator, motion
 from firmware_py.core.tables import GAIN_COLUMNS, CarTable, GainTable, LegTable
 from firmware_py.errors import UserError
 from firmware_py.feedforward import slip_feedforward
@@ -29,16 +29,24 @@ GAINS_COLUMNS = (
     "kp",
     "ki",
     "kd",
+    "l_o",
     "l_ee",
     "l_ep",
     "l_pe",
     "l_pp",
-    "l_de",
-    "l_dp",
+    "l_be",
+    "l_bp",
+    "l_dr",
+    "m_ee",
+    "m_ep",
+    "m_pe",
+    "m_pp",
+    "m_de",
+    "m_dp",
 )
 LAWS = {"car": 1, "pid+ff": 0}
 """The laws by name, and whether each predicts over latency and lag. A law without observer has one in its table that
-takes each pose as it comes (l_ee = l_pp = 1, the rest 0)."""
+takes each pose as it comes (l_ee = l_pp = m_ee = m_pp = 1, the rest 0)."""
 
 SIDES = {"left": 1.0, "right": -1.0}
 
@@ -49,9 +57,10 @@ CAR_RANGES = {
     "yaw_inertia_kgm2": (10.0, 1e6),
     "cornering_stiffness_front_n_per_rad": (1e3, 1e7),
     "cornering_stiffness_rear_n_per_rad": (1e3, 1e7),
+    "relaxation_length_m": (0.0, 2.0),
     "steering_lag_s": (0.0, 2.0),
-    "pose_latency_samples": (0, predictor.QUEUE_LENGTH - 1),
-    "command_latency_samples": (0, predictor.QUEUE_LENGTH - 1),
+    "pose_latency_samples": (0, estimator.ODOMETRY_LENGTH - 1),
+    "command_latency_samples": (0, motion.QUEUE_LENGTH - 2),
     "drive_lag_s": (0.0, 5.0),
     "brake_lag_s": (0.0, 2.0),
     "gear_change_s": (0.0, 10.0),
@@ -173,22 +182,14 @@ def _load_car(file: Path, period_s: float) -> tuple[CarTable, dict[str, float]]:
         value = values.get(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
             raise UserError(f"{file}: {key} is {value}, must be a number from {low} to {high}; {REMEDY}")
-    if values["pose_latency_samples"] + values["command_latency_samples"] >= predictor.QUEUE_LENGTH:
-        raise UserError(
-            f"{file}: pose_latency_samples and command_latency_samples together must be below "
-            f"{predictor.QUEUE_LENGTH}; {REMEDY}"
-        )
     lag_s = float(values["steering_lag_s"])
-    alpha = 1.0
-    mean_weight = 0.0
-    if lag_s > 0.0:
-        alpha = 1.0 - math.exp(-period_s / lag_s)
-        mean_weight = lag_s / period_s * alpha
+    alpha, mean_weight, late_weight = motion.lag_weights(lag_s, period_s)
     car = CarTable(
         wheelbase_m=float(values["wheelbase_m"]),
         steering_lag_s=lag_s,
         lag_alpha=alpha,
         lag_mean_weight=mean_weight,
+        late_weight=late_weight,
         pose_latency_samples=int(values["pose_latency_samples"]),
         command_latency_samples=int(values["command_latency_samples"]),
         drive_lag_s=float(values["drive_lag_s"]),
@@ -245,8 +246,8 @@ def _legs(
                 x_m=tuple(x[::order]),
                 y_m=tuple(mirror * value for value in y[::order]),
                 yaw_rad=tuple(mirror * value for value in yaw[::order]),
-                curvature_1pm=tuple(travel_curvature),
                 slip_heading_rad=slip.heading_rad,
+                slip_curvature_1pm=slip.slip_curvature_1pm,
                 feedforward_curvature_1pm=slip.curvature_1pm,
                 feedforward_slope_1pm2=slip.slope_1pm2,
                 speed_mps=tuple(row[2] for row in rows),

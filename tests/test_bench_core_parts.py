@@ -4,22 +4,8 @@ import random
 
 from core_support import shipped_tables
 
-from firmware_py.core import path, supervisor
+from firmware_py.core import supervisor
 from firmware_py.core.schedule import gains_at
-
-
-def test_parts_of_a_path_point_are_those_of_the_whole_point():
-    rng = random.Random(2)
-    for leg in shipped_tables().leg:
-        ends = (-0.3, 0.0, leg.length_m, leg.length_m + 0.3, leg.step_m, leg.length_m - leg.step_m)
-        for station_m in (*ends, *(rng.uniform(-0.5, leg.length_m + 0.5) for _ in range(2000))):
-            whole = path.locate(leg, station_m)
-            assert path.pose_at(leg, station_m) == (whole.x_m, whole.y_m, whole.yaw_rad, whole.slip_heading_rad)
-            assert path.feedforward_at(leg, station_m) == (
-                whole.feedforward_curvature_1pm,
-                whole.feedforward_slope_1pm2,
-            )
-            assert path.plan_at(leg, station_m) == (whole.speed_mps, whole.accel_mps2)
 
 
 def test_the_row_of_the_schedule_is_found_at_every_grid_speed_and_between():
@@ -30,7 +16,7 @@ def test_the_row_of_the_schedule_is_found_at_every_grid_speed_and_between():
             speed_mps = grid[row] + share * (grid[row + 1] - grid[row])
             b = (speed_mps - grid[row]) / (grid[row + 1] - grid[row])
             low, high = table.gain[1][row], table.gain[1][row + 1]
-            found = gains_at(table, 1, speed_mps)
+            found = gains_at(table, 1, speed_mps, 1)
             for value, one, other in zip(found, low, high, strict=True):
                 assert abs(value - ((1.0 - b) * one + b * other)) <= 1e-12 * max(abs(one), abs(other))
 

@@ -6,11 +6,11 @@ import random
 import pytest
 from core_support import shipped_tables, standing_inputs
 
-from firmware_py.core import controller, motion, observer, pid, predictor
+from firmware_py.core import controller, motion, pid
 from firmware_py.core import signals as s
-from firmware_py.core.path import feedforward_at, feedforward_curvature_1pm, locate, pose_error, wrap_angle
+from firmware_py.core.path import feedforward_at, feedforward_curvature_1pm, pose_at, wrap_angle
 from firmware_py.core.schedule import gains_at
-from firmware_py.core.tables import GAIN_COLUMNS, KP
+from firmware_py.core.tables import GAIN_COLUMNS, KP, L_EE, M_EE
 
 FORWARD, REVERSE = 0, 1
 
@@ -22,27 +22,26 @@ def test_angles_wrap_into_minus_pi_to_pi():
 
 
 @pytest.mark.parametrize("direction", [FORWARD, REVERSE])
-def test_error_signs_are_the_bodys_in_both_directions(direction):
-    leg = shipped_tables().leg[direction]
-    point = locate(leg, 0.5 * leg.length_m)
-    left = (point.x_m - 0.1 * math.sin(point.yaw_rad), point.y_m + 0.1 * math.cos(point.yaw_rad))
-    body_yaw_rad = point.yaw_rad + point.slip_heading_rad
-    error = pose_error(point, leg.sigma, *left, body_yaw_rad + 0.05)
-    assert error.cross_track_error_m == pytest.approx(0.1), "left of the path, seen along the body, is positive"
-    assert error.heading_error_rad == pytest.approx(0.05), "turned to the left is positive"
-    ahead = (point.x_m + 0.1 * math.cos(point.yaw_rad), point.y_m + 0.1 * math.sin(point.yaw_rad))
-    assert pose_error(point, leg.sigma, *ahead, body_yaw_rad).along_m == pytest.approx(0.1 * leg.sigma)
-
-
-@pytest.mark.parametrize("direction", [FORWARD, REVERSE])
 def test_the_path_goes_on_straight_beyond_its_ends(direction):
     leg = shipped_tables().leg[direction]
     for station_m, inside_m in ((-0.3, 0.0), (leg.length_m + 0.3, leg.length_m)):
-        out, at = locate(leg, station_m), locate(leg, inside_m)
+        x_m, y_m, yaw_rad, *slip = pose_at(leg, station_m)
+        at_x_m, at_y_m, at_yaw_rad, *at_slip = pose_at(leg, inside_m)
         along_m = leg.sigma * (station_m - inside_m)
-        assert out.x_m == pytest.approx(at.x_m + along_m * math.cos(at.yaw_rad), abs=1e-12)
-        assert out.yaw_rad == at.yaw_rad
-        assert feedforward_curvature_1pm(leg, station_m) == out.feedforward_curvature_1pm
+        assert x_m == pytest.approx(at_x_m + along_m * math.cos(at_yaw_rad), abs=1e-12)
+        assert y_m == pytest.approx(at_y_m + along_m * math.sin(at_yaw_rad), abs=1e-12)
+        assert (yaw_rad, slip) == (at_yaw_rad, at_slip)
+        assert feedforward_curvature_1pm(leg, station_m) == feedforward_at(leg, inside_m)[0]
+
+
+@pytest.mark.parametrize("direction", [FORWARD, REVERSE])
+def test_between_two_rows_the_path_is_blended(direction):
+    leg = shipped_tables().leg[direction]
+    columns = (leg.x_m, leg.y_m, leg.yaw_rad, leg.slip_heading_rad, leg.slip_curvature_1pm)
+    for row in (0, 17, leg.last_row - 1):
+        found = pose_at(leg, (row + 0.25) * leg.step_m)
+        for value, column in zip(found, columns, strict=True):
+            assert value == pytest.approx(0.75 * column[row] + 0.25 * column[row + 1], abs=1e-12)
 
 
 @pytest.mark.parametrize("direction", [FORWARD, REVERSE])
@@ -51,7 +50,7 @@ def test_the_two_lookups_of_the_feedforward_agree(direction):
     rng = random.Random(2)
     for _ in range(500):
         station_m = rng.uniform(-0.1, leg.length_m + 0.1)
-        assert feedforward_curvature_1pm(leg, station_m) == locate(leg, station_m).feedforward_curvature_1pm
+        assert feedforward_curvature_1pm(leg, station_m) == feedforward_at(leg, station_m)[0]
 
 
 @pytest.mark.parametrize("direction", [FORWARD, REVERSE])
@@ -59,45 +58,34 @@ def test_the_model_on_the_path_with_the_feedforward_stays_on_the_path(direction)
     tables = shipped_tables()
     leg = tables.leg[direction]
     car = tables.car._replace(lag_alpha=1.0, lag_mean_weight=0.0, max_road_wheel_rate_radps=10.0)
-    state = motion.PathState(0.0, 0.0, 0.0, 0.0, 0.0)
-    worst_m = 0.0
-    while state.station_m < leg.length_m - 0.02:
-        curvature = feedforward_curvature_1pm(leg, state.station_m + 0.005)
-        state = motion.advance(leg, car, state, math.atan(car.wheelbase_m * curvature), 1.0, 0.01)
-        worst_m = max(worst_m, abs(state.cross_track_error_m))
+    station_m = cross_m = heading_rad = angle_rad = worst_m = 0.0
+    while station_m < leg.length_m - 0.02:
+        target_rad = math.atan(car.wheelbase_m * feedforward_curvature_1pm(leg, station_m + 0.005))
+        station_m, cross_m, heading_rad, angle_rad = motion.advance(
+            leg, car, station_m, cross_m, heading_rad, angle_rad, target_rad, 0.0, 1.0, 0.01
+        )
+        worst_m = max(worst_m, abs(cross_m))
     assert worst_m < 1e-4
-    # and the model notices a curvature disturbance on the side where it acts
-    pushed = motion.advance(leg, car, motion.PathState(0.0, 0.0, 0.0, 0.01, 0.0), 0.0, 1.0, 0.01)
-    assert pushed.heading_error_rad * leg.sigma > 0
+    # and the model turns to the side to which a disturbance turns the wheels
+    pushed = motion.advance(leg, car, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04, 1.0, 0.01)
+    assert pushed[2] * leg.sigma > 0
 
 
-@pytest.mark.parametrize("direction", [FORWARD, REVERSE])
-def test_feedback_brings_the_car_back_to_the_path_in_both_directions(direction):
-    tables = shipped_tables()
-    leg = tables.leg[direction]
-    car = tables.car
-    for start_m, start_rad in ((0.05, 0.0), (-0.05, 0.02), (0.0, -0.03)):
-        state = motion.PathState(0.0, start_m, start_rad, 0.0, 0.0)
-        queue = (0.0,) * predictor.QUEUE_LENGTH
-        for _ in range(800):
-            gains = gains_at(tables.gains, direction, 0.8)
-            ahead = predictor.predict(leg, car, state, queue, 0.8, 0.01)
-            feedback = pid.feedback_1pm(ahead.cross_track_error_m, ahead.heading_error_rad, 0.0, gains, leg.sigma)
-            curvature, slope = feedforward_at(leg, ahead.station_m)
-            leads = car.steering_lag_s * 0.8 * car.wheelbase_m * slope / (1.0 + (car.wheelbase_m * curvature) ** 2)
-            angle = math.atan(car.wheelbase_m * (curvature - feedback)) + leads
-            latency = car.pose_latency_samples + car.command_latency_samples
-            state = motion.advance(leg, car, state, ([angle, *queue])[latency], 0.8, 0.01)
-            queue = (angle, *queue[:-1])
-        assert abs(state.cross_track_error_m) < 0.2 * max(abs(start_m), 0.02)
+ESTIMATORS = {1: (*range(5), *range(L_EE, M_EE)), 0: (*range(5), *range(M_EE, GAIN_COLUMNS))}
+"""Columns that are in force with a fresh yaw rate (1) and without (0)."""
 
 
-def test_gains_are_exactly_those_of_the_row_and_held_beyond_the_grid():
+@pytest.mark.parametrize("with_yaw_rate", [0, 1])
+def test_gains_are_exactly_those_of_the_row_and_held_beyond_the_grid(with_yaw_rate):
     table = shipped_tables().gains
     for direction in (FORWARD, REVERSE):
         for row, speed_mps in enumerate(table.speed_grid_mps):
-            assert tuple(gains_at(table, direction, speed_mps)) == pytest.approx(table.gain[direction][row], abs=1e-15)
-        assert gains_at(table, direction, 99.0) == gains_at(table, direction, table.speed_grid_mps[-1])
+            expected = [table.gain[direction][row][column] for column in ESTIMATORS[with_yaw_rate]]
+            found = gains_at(table, direction, speed_mps, with_yaw_rate)
+            assert list(found)[: len(expected)] == pytest.approx(expected, abs=1e-13)
+        assert gains_at(table, direction, 99.0, with_yaw_rate) == gains_at(
+            table, direction, table.speed_grid_mps[-1], with_yaw_rate
+        )
 
 
 @pytest.mark.parametrize("column", range(GAIN_COLUMNS))
@@ -110,12 +98,13 @@ def test_changing_one_row_of_one_direction_changes_nothing_else(column):
     grid = table.speed_grid_mps
     for step in range(1101):
         speed_mps = step * 1e-3
-        assert gains_at(changed, FORWARD, speed_mps) == gains_at(table, FORWARD, speed_mps)
-        before, after = gains_at(table, REVERSE, speed_mps), gains_at(changed, REVERSE, speed_mps)
-        difference = [b - a for a, b in zip(before, after, strict=True)]
         inside = grid[row - 1] < speed_mps < grid[row + 1]
-        assert (difference[column] > 1e-9) == inside
-        assert all(abs(value) < 1e-12 for i, value in enumerate(difference) if i != column)
+        for with_yaw_rate, columns in ESTIMATORS.items():
+            asked = (speed_mps, with_yaw_rate)
+            assert gains_at(changed, FORWARD, *asked) == gains_at(table, FORWARD, *asked)
+            before, after = gains_at(table, REVERSE, *asked), gains_at(changed, REVERSE, *asked)
+            for of_column, one, other in zip(columns, before, after, strict=False):
+                assert (abs(other - one) > 1e-9) == (inside and of_column == column)
 
 
 def test_the_controller_uses_the_row_of_its_direction():
@@ -146,52 +135,8 @@ def test_the_controller_uses_the_row_of_its_direction():
     assert command(reverse_changed) == command(tables)
 
 
-def test_nothing_drifts_at_standstill():
-    tables = shipped_tables()
-    leg = tables.leg[FORWARD]
-    state = observer.begin(0.0, 0.0)
-    state = state._replace(path=state.path._replace(cross_track_error_m=0.03, curvature_disturbance_1pm=0.004))
-    after = observer.predict_to_pose(leg, tables.car, state, 0.0, 0.0, 0.01)
-    assert after.path == state.path
-    gains = gains_at(tables.gains, FORWARD, 0.0)
-    assert pid.integrate_m2(0.01, 0.03, 0.0, gains, 0) == 0.01
-    corrected = observer.correct_moving(state, gains, observer.PoseError(0.0, 0.02, 0.01))
-    assert corrected.path.curvature_disturbance_1pm == state.path.curvature_disturbance_1pm
-
-
-def test_standing_poses_are_averaged_to_their_mean():
-    tables = shipped_tables()
-    leg = tables.leg[FORWARD]
-    rng = random.Random(3)
-    state = observer.begin(0.0, 0.0)
-    start = locate(leg, 0.0)
-    poses = [(start.x_m + rng.gauss(0, 0.01), rng.gauss(0.02, 0.01), rng.gauss(0, 0.002)) for _ in range(100)]
-    for pose in poses:
-        state = observer.correct_standing(state, observer.innovation(leg, state, *pose))
-    mean_m = sum(pose[1] for pose in poses) / len(poses)
-    assert state.path.cross_track_error_m == pytest.approx(mean_m, abs=2e-4)
-
-
-def test_turning_round_keeps_the_bodys_errors_and_counts_station_from_the_end():
-    leg = shipped_tables().leg[REVERSE]
-    before = observer.ObserverState(motion.PathState(leg.length_m - 0.02, 0.003, -0.002, 0.004, 0.1), 7, 1)
-    after = observer.turn_round(leg, before)
-    assert after.path == before.path._replace(station_m=pytest.approx(0.02))
-
-
-def test_a_pose_beyond_the_gate_is_not_believed_and_counted():
-    tables = shipped_tables()
-    gains = gains_at(tables.gains, FORWARD, 0.5)
-    state = observer.begin(1.0, 0.0)
-    inside = observer.correct_moving(state, gains, observer.PoseError(0.0, observer.GATE_CROSS_M, 0.0))
-    assert inside.disbelieved == 0
-    assert inside.path != state.path
-    outside = observer.correct_moving(state, gains, observer.PoseError(0.0, observer.GATE_CROSS_M + 1e-9, 0.0))
-    assert (outside.disbelieved, outside.path) == (1, state.path)
-
-
 def test_the_integral_stands_still_while_limited_and_stays_within_its_authority():
-    gains = gains_at(shipped_tables().gains, FORWARD, 0.5)._replace(ki=0.4)
+    gains = gains_at(shipped_tables().gains, FORWARD, 0.5, 1)._replace(ki=0.4)
     assert pid.integrate_m2(0.01, 0.05, 0.01, gains, 1) == 0.01
     integral = 0.0
     for _ in range(100_000):

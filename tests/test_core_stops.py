@@ -125,7 +125,7 @@ def test_a_pose_that_jumps_while_the_gear_changes_is_not_believed():
     bench = Bench().arm()
     bench.step(10, along_m=0.4)
     assert bench.why == (s.MODE_FAULT, c.POSE_JUMP)
-    assert abs(bench.state.observer.path.station_m) < 0.05
+    assert abs(bench.state.estimator.station_m) < 0.05
 
 
 @pytest.mark.parametrize(

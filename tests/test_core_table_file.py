@@ -107,7 +107,7 @@ def test_speeds_of_the_schedule_must_be_the_same_in_both_directions(folder):
     [
         ("wheelbase_m", "0.0", "wheelbase_m is 0.0, must be a number from 1.0 to 10.0"),
         ("max_road_wheel_rate_radps", '"fast"', "max_road_wheel_rate_radps is fast"),
-        ("pose_latency_samples", "47", "together must be below 48"),
+        ("pose_latency_samples", "47", "pose_latency_samples is 47, must be a number from 0 to 31"),
     ],
 )
 def test_values_of_the_car_out_of_range(folder, key, value, says):

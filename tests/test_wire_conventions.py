@@ -13,7 +13,7 @@ from cantools.database.can import Message
 from test_wire_independent import LAYOUT, bitwise_crc, encode
 
 from firmware_py.codec import load_codec
-from firmware_py.core import health, manoeuvre, observer, speed, supervisor
+from firmware_py.core import estimator, health, manoeuvre, speed, supervisor
 from firmware_py.core.signals import QUALITY_FIXED
 from sim.data_files import PARAMETERS, load_course, load_vehicle, shipped_names
 
@@ -198,7 +198,7 @@ def test_the_limits_are_those_of_the_controller() -> None:
     over = f"{health.OVER_SPEED_SHARE:g} x `max_speed_mps` + {health.OVER_SPEED_MPS:g} m/s"
     assert rows["speed"] == (over, "at once")
     assert rows["pose against its prediction"] == (
-        f"{observer.GATE_CROSS_M:.2f} m along or across, or {observer.GATE_HEADING_RAD:g} rad",
+        f"{estimator.GATE_CROSS_M:.2f} m along or across, or {estimator.GATE_HEADING_RAD:g} rad",
         f"{health.JUMPS_IN_A_ROW} poses in a row",
     )
     assert rows["distance from the path"][0] == (

@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
         return DONE
     figures = _design(vehicle, course, options.tables, options.out)
     _write_json(options.json, figures)
-    return DONE if figures["certificate"]["all_d_stable"] else DIFFERENT
+    return DONE if figures["certificate"]["holds"] else DIFFERENT
 
 
 def _shipped(options: argparse.Namespace) -> int:
@@ -101,7 +101,11 @@ def _shipped(options: argparse.Namespace) -> int:
 def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | None = None) -> dict[str, Any]:
     """Design, certify, show, and write where a folder is given; nothing is written where the certificate fails."""
     from tools.design import tables  # noqa: PLC0415 -- scipy
-    from tools.design.certificate import certify  # noqa: PLC0415 -- python-control
+    from tools.design.certificate import (  # noqa: PLC0415 -- scipy
+        LEAST_DELAY_MARGIN_SAMPLES,
+        LEAST_DISK_MARGIN,
+        certify,
+    )
 
     report = tables.run_design(vehicle, course)
     certificate = certify(vehicle, report.gains)
@@ -114,9 +118,12 @@ def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | N
         sheet.draw(report, certificate, out / "design.png")
         _write_json(out / "design.json", figures)
         print(f"sheet in {out / 'design.png'}")
-    if not certificate.all_d_stable:
+    if not certificate.holds:
         raise UserError(
-            f"vehicle {vehicle.name}: the design is not stable in its whole box; worst: {certificate.worst}"
+            f"vehicle {vehicle.name}: the design does not hold in its whole box (disk margin"
+            f" {certificate.min_disk_margin:.2f} must be {LEAST_DISK_MARGIN:g}, delay margin"
+            f" {certificate.min_delay_margin_samples:.1f} samples must be {LEAST_DELAY_MARGIN_SAMPLES:g}, D-stable:"
+            f" {certificate.all_d_stable}); worst: {certificate.worst}"
         )
     if folder is not None:
         tables.write_tables(report, folder)
@@ -204,10 +211,13 @@ def _show(figures: dict[str, Any]) -> None:
     table = Table(title=f"design: {figures['vehicle']} on {figures['course']}", title_justify="left")
     table.add_column("what")
     table.add_column("value", justify="right")
-    for part in ("path", "certificate"):
-        for name, value in figures.get(part, {}).items():
+    certificate = {name: value for name, value in figures["certificate"].items() if name not in ("others", "by_speed")}
+    parts = [("", figures["path"]), ("", certificate)]
+    parts += [(f"{name}: ", other) for name, other in figures["certificate"]["others"].items()]
+    for prefix, part in parts:
+        for name, value in part.items():
             shown = ", ".join(f"{v:.2f}" for v in value) if isinstance(value, list) else value
-            table.add_row(name, f"{shown:.4g}" if isinstance(shown, float) else str(shown))
+            table.add_row(prefix + name, f"{shown:.4g}" if isinstance(shown, float) else str(shown))
     Console().print(table)
 
 

@@ -1,6 +1,7 @@
 """One control cycle, from reports to commands: the straight line of the whole controller.
 
-    health -> supervisor -> manoeuvre -> observer (path) -> schedule -> feedforward + PID -> limits -> speed -> gate
+    health -> supervisor -> manoeuvre -> schedule -> estimator -> predictor -> feedforward + PID -> limits -> speed
+    -> gate
 
 Pure: `step(tables, state, inputs) -> (state, outputs)`. Nothing here reads a clock, a bus or a file.
 """
@@ -9,11 +10,11 @@ import math
 from typing import NamedTuple
 
 from firmware_py.core import conditions as c
+from firmware_py.core import estimator, health, limits, manoeuvre, pid, predictor, speed, supervisor
 from firmware_py.core import gate as last_gate
-from firmware_py.core import health, limits, manoeuvre, observer, pid, predictor, speed, supervisor
-from firmware_py.core.motion import PathState
+from firmware_py.core.motion import QUEUE_LENGTH
 from firmware_py.core.path import feedforward_at, plan_at
-from firmware_py.core.schedule import Gains, gains_at
+from firmware_py.core.schedule import gains_at
 from firmware_py.core.signals import (
     GEAR_NONE,
     GEAR_PARK,
@@ -23,6 +24,7 @@ from firmware_py.core.signals import (
     MODE_FAULT,
     MODE_MANUAL,
     MODE_READY,
+    NO_COUNTER,
     Inputs,
     LongCommand,
     Outputs,
@@ -30,7 +32,7 @@ from firmware_py.core.signals import (
     SysCommand,
     Track,
 )
-from firmware_py.core.tables import CarTable, LegTable, Tables
+from firmware_py.core.tables import CarTable, Tables
 
 PERIOD_US = 10_000
 PERIOD_S = 0.01
@@ -49,7 +51,7 @@ class State(NamedTuple):
     health: health.HealthState
     supervisor: supervisor.SupervisorState
     manoeuvre: manoeuvre.ManoeuvreState
-    observer: observer.ObserverState
+    estimator: estimator.EstimatorState
     speed: speed.SpeedState
     integral_m2: float
     limited: int
@@ -66,11 +68,11 @@ def begin() -> State:
         health=health.begin(),
         supervisor=supervisor.begin(),
         manoeuvre=manoeuvre.begin(),
-        observer=observer.begin(0.0, 0.0),
+        estimator=estimator.begin(),
         speed=speed.begin(0.0),
         integral_m2=0.0,
         limited=0,
-        sent_angles_rad=(0.0,) * predictor.QUEUE_LENGTH,
+        sent_angles_rad=(0.0,) * QUEUE_LENGTH,
         angle_carry_rad=0.0,
         speed_mps=0.0,
         standstill=0,
@@ -97,14 +99,14 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     leg_state = _manoeuvre(state, car, inputs, decided.mode, standstill)
     direction = manoeuvre.direction_of(leg_state.leg)
     leg = tables.leg[direction]
-    observed = state.observer
+    estimated = state.estimator
     reference = state.speed
     integral_m2 = state.integral_m2
     if direction != manoeuvre.direction_of(state.manoeuvre.leg):
-        observed = observer.turn_round(leg, observed)
-        reference = speed.begin(observed.path.station_m)
+        estimated = estimator.turn_round(leg, estimated)
+        reference = speed.begin(estimated.station_m)
     if not active and not stopping_on_path:
-        reference = speed.begin(observed.path.station_m)
+        reference = speed.begin(estimated.station_m)
         integral_m2 = 0.0
 
     # Where the car is, and where it will be when this cycle's command acts.
@@ -115,38 +117,49 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         travel_mps = max(travel_mps - car.controlled_decel_mps2 * dt_s, 0.0)
     if standstill:
         travel_mps = 0.0
-    gains = gains_at(tables.gains, direction, max(travel_mps, 0.0))
-    observed = _observe(
-        tables, leg, gains, observed, state, inputs, health_state.pose_is_new, travel_mps, standstill, active, dt_s
+    is_fresh = 0
+    if inputs.used.used_motion_counter != NO_COUNTER and inputs.motion.yaw_rate_valid != 0:
+        is_fresh = 1
+    gains = gains_at(tables.gains, direction, max(travel_mps, 0.0), is_fresh)
+    estimated = estimator.estimate(
+        leg,
+        car,
+        gains,
+        estimated,
+        _motion(car, leg.sigma, state, inputs, travel_mps, is_fresh, standstill, active or stopping_on_path, dt_s),
+        health_state.pose_is_new,
+        inputs.position.position_x_m,
+        inputs.position.position_y_m,
+        inputs.attitude.yaw_rad,
+        car.pose_latency_samples if tables.uses_predictor != 0 else 0,
     )
-    if not active and not stopping_on_path:
-        observed = _rest_angle(observed, inputs.steer.road_wheel_angle_meas_rad)
-    ahead = predictor.predict(leg, car, observed.path, state.sent_angles_rad, travel_mps, PERIOD_S)
+    station_m, cross_m, heading_rad = predictor.predict(
+        leg, car, estimated, state.sent_angles_rad, travel_mps, PERIOD_S
+    )
     if tables.uses_predictor == 0:
-        ahead = _unpredicted(observed.path, ahead.station_m)
+        cross_m = estimated.cross_track_error_m
+        heading_rad = estimated.heading_error_rad
 
     # Steering: feedforward + PID - disturbance, within the limits.
-    feedforward_1pm, slope_1pm2 = feedforward_at(leg, ahead.station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
+    feedforward_1pm, slope_1pm2 = feedforward_at(leg, station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
+    feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral_m2, gains, leg.sigma)
     wanted_rad = _steering(
         car,
         feedforward_1pm,
         slope_1pm2,
-        ahead.cross_track_error_m,
-        ahead.heading_error_rad,
-        ahead.curvature_disturbance_1pm,
-        integral_m2,
-        gains,
-        leg.sigma,
+        feedback_1pm,
         travel_mps,
     )
+    wanted_rad -= estimated.road_disturbance_rad + estimated.steering_offset_rad
+    wanted_rad /= estimated.steering_gain
     if not active and not stopping_on_path:
         wanted_rad = inputs.steer.road_wheel_angle_meas_rad
     limited = limits.limit_angle(car, wanted_rad, state.sent_angles_rad[0], PERIOD_S)
-    preview_m = pid.preview_error_m(ahead.cross_track_error_m, ahead.heading_error_rad, gains.preview_m, leg.sigma)
+    preview_m = pid.preview_error_m(cross_m, heading_rad, gains.preview_m, leg.sigma)
     integral_m2 = pid.integrate_m2(integral_m2, preview_m, travel_mps * dt_s, gains, limited.limited)
 
     # Speed, then the last word.
-    station_now_m = observed.path.station_m + travel_mps * (REPORT_AGE_S + car.pose_latency_samples * PERIOD_S)
+    station_now_m = estimated.station_m + travel_mps * REPORT_AGE_S
     speed_command = speed.hold()
     if active and leg_state.driving != 0:
         reference, speed_command = speed.follow(leg, car, reference, station_now_m, travel_mps, dt_s)
@@ -171,7 +184,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         health_state,
         decided,
         leg_state,
-        observed,
+        estimated,
         reference,
         integral_m2,
         limited.limited,
@@ -180,7 +193,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         leg.sigma * travel_mps,
         1 if standstill else 0,
     )
-    return next_state, _outputs(decided, leg_state, passed, observed, standstill)
+    return next_state, _outputs(decided, leg_state, passed, estimated, car.wheelbase_m, standstill)
 
 
 def _elapsed_s(last_us: int, now_us: int) -> float:
@@ -191,7 +204,7 @@ def _elapsed_s(last_us: int, now_us: int) -> float:
 
 
 def _believed(tables: Tables, state: State) -> health.Believed:
-    path = state.observer.path
+    path = state.estimator
     leg = tables.leg[manoeuvre.direction_of(state.manoeuvre.leg)]
     planned_mps, _accel_mps2 = plan_at(leg, path.station_m)
     return health.Believed(
@@ -204,9 +217,9 @@ def _believed(tables: Tables, state: State) -> health.Believed:
         path.cross_track_error_m,
         path.heading_error_rad,
         path.station_m,
-        state.observer.disbelieved,
-        state.observer.averaged,
-        path.road_wheel_angle_rad,
+        path.disbelieved,
+        path.averaged,
+        path.modelled_angle_rad,
     )
 
 
@@ -230,59 +243,32 @@ def _manoeuvre(state: State, car: CarTable, inputs: Inputs, mode: int, standstil
     return manoeuvre.begin()
 
 
-def _observe(
-    tables: Tables,
-    leg: LegTable,
-    gains: Gains,
-    observed: observer.ObserverState,
+def _motion(
+    car: CarTable,
+    sigma: float,
     state: State,
     inputs: Inputs,
-    pose_is_new: int,
     travel_mps: float,
+    yaw_rate_is_fresh: int,
     standstill: bool,
-    active: bool,
+    follows: bool,
     dt_s: float,
-) -> observer.ObserverState:
-    """Return the observer at the age of the newest pose, predicted by odometry and corrected if a pose arrived."""
-    car = tables.car
-    acted_rad = state.sent_angles_rad[car.pose_latency_samples + car.command_latency_samples]
-    observed = observer.predict_to_pose(leg, car, observed, acted_rad, travel_mps, dt_s)
-    if pose_is_new == 0:
-        return observed
-    error = observer.innovation(
-        leg, observed, inputs.position.position_x_m, inputs.position.position_y_m, inputs.attitude.yaw_rad
-    )
-    if active and not observer.is_believable(error):
-        return observer.disbelieve(observed)
-    if standstill:
-        return observer.correct_standing(observed, error)
-    return observer.correct_moving(observed, gains, error)
-
-
-def _rest_angle(observed: observer.ObserverState, angle_rad: float) -> observer.ObserverState:
-    """Return the observer with the wheels where they are measured: nothing is commanded, so nothing is modelled."""
-    path = observed.path
-    return observer.ObserverState(
-        PathState(
-            path.station_m,
-            path.cross_track_error_m,
-            path.heading_error_rad,
-            path.curvature_disturbance_1pm,
-            angle_rad,
-        ),
-        observed.averaged,
-        observed.disbelieved,
-    )
-
-
-def _unpredicted(path: PathState, station_m: float) -> PathState:
-    """Return the errors as they are at the pose's age, for a law that predicts nothing but the station."""
-    return PathState(
-        station_m,
-        path.cross_track_error_m,
-        path.heading_error_rad,
-        path.curvature_disturbance_1pm,
-        path.road_wheel_angle_rad,
+) -> estimator.Motion:
+    """Return what this cycle's reports tell of the motion since the last one's."""
+    n = car.command_latency_samples
+    angle_is_fresh = 0
+    if inputs.used.used_steer_counter != NO_COUNTER and inputs.steer.steer_angle_valid != 0:
+        angle_is_fresh = 1
+    return estimator.Motion(
+        0.5 * (sigma * state.speed_mps + travel_mps) * dt_s,
+        dt_s,
+        state.sent_angles_rad[n] + car.late_weight * (state.sent_angles_rad[n + 1] - state.sent_angles_rad[n]),
+        inputs.steer.road_wheel_angle_meas_rad,
+        angle_is_fresh,
+        inputs.motion.yaw_rate_meas_radps,
+        yaw_rate_is_fresh,
+        1 if standstill else 0,
+        1 if follows else 0,
     )
 
 
@@ -290,18 +276,12 @@ def _steering(
     car: CarTable,
     feedforward_1pm: float,
     slope_1pm2: float,
-    cross_track_error_m: float,
-    heading_error_rad: float,
-    disturbance_1pm: float,
-    integral_m2: float,
-    gains: Gains,
-    sigma: float,
+    correction_1pm: float,
     travel_mps: float,
 ) -> float:
-    """Return the wanted road-wheel angle: feedforward, less feedback and disturbance, ahead of the actuator's lag."""
+    """Return the wanted road-wheel angle: feedforward less correction (1/m), ahead of the actuator's lag."""
     reference = car.wheelbase_m * feedforward_1pm
-    feedback_1pm = pid.feedback_1pm(cross_track_error_m, heading_error_rad, integral_m2, gains, sigma)
-    angle_rad = math.atan(reference - car.wheelbase_m * (feedback_1pm + disturbance_1pm))
+    angle_rad = math.atan(reference - car.wheelbase_m * correction_1pm)
     rate_radps = travel_mps * car.wheelbase_m * slope_1pm2 / (1.0 + reference * reference)
     return angle_rad + car.steering_lag_s * rate_radps
 
@@ -310,7 +290,8 @@ def _outputs(
     decided: supervisor.SupervisorState,
     leg_state: manoeuvre.ManoeuvreState,
     passed: last_gate.Passed,
-    observed: observer.ObserverState,
+    estimated: estimator.EstimatorState,
+    wheelbase_m: float,
     standstill: bool,
 ) -> Outputs:
     """Return the frames' values. In Fault the vehicle stays enabled until it stands, to steer while braking."""
@@ -329,7 +310,6 @@ def _outputs(
     park_brake = 0
     if (passed.follow == 0 and standstill) or gear == GEAR_PARK:
         park_brake = 1
-    path = observed.path
     return Outputs(
         SysCommand(
             enable,
@@ -347,9 +327,9 @@ def _outputs(
             passed.follow,
         ),
         Track(
-            max(path.station_m, 0.0),
-            path.cross_track_error_m,
-            path.heading_error_rad,
-            path.curvature_disturbance_1pm,
+            max(estimated.station_m, 0.0),
+            estimated.cross_track_error_m,
+            estimated.heading_error_rad,
+            (estimated.road_disturbance_rad + estimated.steering_offset_rad) / wheelbase_m,
         ),
     )

@@ -1,28 +1,43 @@
-"""From the observer's state, which is as old as the pose, to the instant at which the next command acts."""
+"""From the newest reports to the instant at which the next command acts."""
 
-from firmware_py.core.motion import PathState, advance
+from firmware_py.core.estimator import EstimatorState
+from firmware_py.core.motion import advance
 from firmware_py.core.tables import CarTable, LegTable
-
-QUEUE_LENGTH = 48
-"""Commands that are remembered; latency of pose and command together may be one less."""
 
 
 def predict(
     leg: LegTable,
     car: CarTable,
-    state: PathState,
+    state: EstimatorState,
     sent_angles_rad: tuple[float, ...],
     travel_speed_mps: float,
     period_s: float,
-) -> PathState:
-    """Return the state when a command that is sent now begins to act.
+) -> tuple[float, float, float]:
+    """Return station (m), cross-track error (m) and heading error (rad) when a command that is sent now begins to act.
 
-    `sent_angles_rad[0]` is the newest command on its way, QUEUE_LENGTH of them. The commands that are still to act are
-    the last (pose + command latency) of them; the speed is taken as constant over that time.
+    `sent_angles_rad[0]` is the newest command on its way. The commands that are still to act are the last
+    (command latency) of them; the speed is taken as constant over that time.
     """
-    ahead = state
-    remaining = car.pose_latency_samples + car.command_latency_samples
+    station_m = state.station_m
+    cross_m = state.cross_track_error_m
+    heading_rad = state.heading_error_rad
+    road_rad = state.road_disturbance_rad
+    gain = state.steering_gain
+    offset_rad = state.steering_offset_rad
+    angle_rad = state.road_wheel_angle_rad
+    remaining = car.command_latency_samples
     while remaining > 0:
         remaining -= 1
-        ahead = advance(leg, car, ahead, sent_angles_rad[remaining], travel_speed_mps, period_s)
-    return ahead
+        station_m, cross_m, heading_rad, angle_rad = advance(
+            leg,
+            car,
+            station_m,
+            cross_m,
+            heading_rad,
+            angle_rad,
+            gain * sent_angles_rad[remaining] + offset_rad,
+            road_rad,
+            travel_speed_mps,
+            period_s,
+        )
+    return station_m, cross_m, heading_rad

@@ -13,16 +13,19 @@ FORWARD = 0
 REVERSE = 1
 
 # Columns of a gain schedule's row, in the order of the file.
-PREVIEW, KP, KI, KD, L_EE, L_EP, L_PE, L_PP, L_DE, L_DP = range(10)
-GAIN_COLUMNS = 10
+PREVIEW, KP, KI, KD, L_O = range(5)
+L_EE, L_EP, L_PE, L_PP, L_BE, L_BP, L_DR = range(5, 12)  # with the yaw rate
+M_EE, M_EP, M_PE, M_PP, M_DE, M_DP = range(12, 18)  # without it
+GAIN_COLUMNS = 18
 
 
 class LegTable(NamedTuple):
     """One leg of the path and its speed profile over travelled station, on a uniform grid of `step_m`.
 
     Yaw is the body's and curvature the body's (wheels to the left positive) in both directions; slopes are per metre
-    of travel. `feedforward_*` is the curvature to steer so that the rear axle follows the path with tyre slip, and
-    `slip_heading_rad` the heading that the body then has relative to the path.
+    of travel. `feedforward_*` is the curvature to steer so that the rear axle follows the path with tyre slip,
+    `slip_heading_rad` the heading that the body then has relative to the path, and `slip_curvature_1pm` how much more
+    curvature the wheels make then than the body has.
     """
 
     sigma: float
@@ -32,8 +35,8 @@ class LegTable(NamedTuple):
     x_m: Column
     y_m: Column
     yaw_rad: Column
-    curvature_1pm: Column
     slip_heading_rad: Column
+    slip_curvature_1pm: Column
     feedforward_curvature_1pm: Column
     feedforward_slope_1pm2: Column
     speed_mps: Column
@@ -49,12 +52,17 @@ class GainTable(NamedTuple):
 
 
 class CarTable(NamedTuple):
-    """The nominal car and its limits, as far as the control law needs them."""
+    """The nominal car and its limits, as far as the control law needs them.
+
+    `lag_alpha` is the share of its gap that the steering closes in a cycle, `lag_mean_weight` the gap's mean over the
+    cycle, `late_weight` the share of the command before the newest in what acts between two reports.
+    """
 
     wheelbase_m: float
     steering_lag_s: float
     lag_alpha: float
     lag_mean_weight: float
+    late_weight: float
     pose_latency_samples: int
     command_latency_samples: int
     drive_lag_s: float

@@ -1,12 +1,12 @@
 """The certificate of a set of gains: stability margins of the whole steering loop over every car that may come true.
 
-Every law, direction, speed of the gain table and middle between two speeds, each with the nominal car and all corners
-of the vehicle's box (`tools.design.gains.corners`). Margins are those of the loop cut at the steering command.
+Every direction, speed of the gain table and middle between two speeds, each with the nominal car and all corners of the
+vehicle's box (`tools.design.gains.corners`). Margins are those of the loop cut at the steering command.
 """
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,12 +19,21 @@ RESOLUTION = 600
 """Frequencies a loop is computed at; margins lie within 2 % of those on ten times as many."""
 
 
+LEAST_DISK_MARGIN = 0.5
+LEAST_DELAY_MARGIN_SAMPLES = 10.0
+"""What every car of a vehicle's box must keep with the law `car`, or there are no tables for the vehicle."""
+
+
 class Certificate(NamedTuple):
-    """The smallest margins of all loops, and where the disk margin is smallest.
+    """The smallest margins of all loops of the law `car`, and where the disk margin is smallest.
 
     Delay in samples of 10 ms beyond the car's own; gain as the factor, up or down, that ends stability; the disk margin
     is the balanced one (any mixture of gain and phase). A loop that is not stable has margins of 0 (gain: 1). D-stable:
-    every pole of every loop is in the D-region of `tools.design.gains`.
+    every pole of every loop is in the D-region of `tools.design.gains`, those of `others` included. `holds`: D-stable
+    with at least the least margins.
+
+    `others` holds the same figures for what is not the usual: the law without the yaw rate, and the other laws.
+    `by_speed` has the smallest disk margin and delay margin of each (direction, speed in m/s).
     """
 
     min_delay_margin_samples: float
@@ -32,7 +41,10 @@ class Certificate(NamedTuple):
     min_gain_margin: float
     min_phase_margin_rad: float
     all_d_stable: bool
+    holds: bool
     worst: str
+    others: dict[str, dict[str, Any]]
+    by_speed: list[tuple[float, float, float, float]]
 
 
 class Margins(NamedTuple):
@@ -52,27 +64,69 @@ def certify(vehicle: Vehicle, gains: dict[str, list[tuple[float, ...]]]) -> Cert
     nominal = model.nominal_of(vehicle)
     cars = criteria.corners(vehicle)
     top_mps = criteria.checked_speeds(vehicle)[-1]
-    found: list[tuple[Margins, str]] = []
-    all_d_stable = True
-    for law, rows in gains.items():
-        for row in _rows(rows, top_mps):
-            where = f"law {law}, direction {row.direction:+.0f}, {row.speed_mps:g} m/s"
-            predicts = law in criteria.PREDICTING_LAWS
-            omega = criteria.frequencies(row.speed_mps, RESOLUTION)
-            loops = model.loop_response(row, nominal, cars, criteria.on_circle(omega), predicts)
-            for car, loop in zip(cars, loops, strict=True):
-                matrix = model.closed_loop(row, nominal, car, predicts)
-                stable = model.is_stable(matrix)
-                all_d_stable = all_d_stable and stable and criteria.d_stable(matrix, row.speed_mps)
-                found.append((margins_of(loop, omega) if stable else UNSTABLE, f"{where}, {car.name}"))
+    found: dict[str, list[_Found]] = {}
+    tables = {law: _rows(rows, top_mps) for law, rows in gains.items()}
+    for index, first in enumerate(tables["car"]):
+        omega = criteria.frequencies(first.speed_mps, RESOLUTION)
+        at = criteria.cars_at_speed(cars, first.speed_mps, first.direction, criteria.on_circle(omega))
+        for law, rows in tables.items():
+            for mode in criteria.MODES[law]:
+                found.setdefault(_name_of(law, mode), []).append(_found(rows[index], nominal, mode, at, omega))
+    usual = found.pop("car")
+    figures = _figures(usual)
+    all_d_stable = all(here.d_stable for some in (usual, *found.values()) for here in some)
     return Certificate(
-        min_delay_margin_samples=min(margins.delay_samples for margins, _ in found),
-        min_disk_margin=min(margins.disk for margins, _ in found),
-        min_gain_margin=min(margins.gain for margins, _ in found),
-        min_phase_margin_rad=min(margins.phase_rad for margins, _ in found),
-        all_d_stable=all_d_stable,
-        worst=min(found, key=lambda item: item[0].disk)[1],
+        **{**figures, "all_d_stable": all_d_stable},
+        holds=all_d_stable
+        and figures["min_disk_margin"] >= LEAST_DISK_MARGIN
+        and figures["min_delay_margin_samples"] >= LEAST_DELAY_MARGIN_SAMPLES,
+        others={name: _figures(some) for name, some in found.items()},
+        by_speed=[(here.direction, here.speed_mps, here.least.disk, here.least.delay_samples) for here in usual],
     )
+
+
+class _Found(NamedTuple):
+    """The least margins of all cars under one row, each by itself, and where the disk margin is smallest."""
+
+    direction: float
+    speed_mps: float
+    least: Margins
+    d_stable: bool
+    worst: str
+
+
+def _name_of(law: str, mode: model.Mode) -> str:
+    return law if mode == criteria.MODES[law][0] else f"{law}, without the yaw rate"
+
+
+def _found(row: Row, nominal: model.Nominal, mode: model.Mode, at: criteria.CarsAtSpeed, omega: Floats) -> _Found:
+    law = model.controller(row, nominal, mode)
+    all_margins = []
+    d_stable = True
+    for plant, loop in zip(at.plants, model.loops(law, at.answers, at.z), strict=True):
+        matrix = model.closed_loop(law, plant)
+        stable = model.is_stable(matrix)
+        d_stable = d_stable and stable and criteria.d_stable(matrix, row.speed_mps)
+        all_margins.append(margins_of(loop, omega) if stable else UNSTABLE)
+    worst = min(range(len(all_margins)), key=lambda car: all_margins[car].disk)
+    return _Found(
+        direction=row.direction,
+        speed_mps=row.speed_mps,
+        least=Margins(*(min(values) for values in zip(*all_margins, strict=True))),
+        d_stable=d_stable,
+        worst=f"direction {row.direction:+.0f}, {row.speed_mps:g} m/s, {at.cars[worst].name}",
+    )
+
+
+def _figures(found: list[_Found]) -> dict[str, Any]:
+    return {
+        "min_delay_margin_samples": min(here.least.delay_samples for here in found),
+        "min_disk_margin": min(here.least.disk for here in found),
+        "min_gain_margin": min(here.least.gain for here in found),
+        "min_phase_margin_rad": min(here.least.phase_rad for here in found),
+        "all_d_stable": all(here.d_stable for here in found),
+        "worst": min(found, key=lambda here: here.least.disk).worst,
+    }
 
 
 def _rows(rows: list[tuple[float, ...]], top_mps: float) -> list[Row]:

@@ -1,33 +1,36 @@
-"""Gain schedules by direction and speed: observer from a Riccati equation, PID as fast as the margins allow.
+"""Gain schedules by direction and speed: estimator from Riccati equations, PID as fast as the margins allow.
 
 Everything is designed per metre of travel and stated for curvature, so that it hardly depends on the wheelbase. The
-observer's process noise is given per root metre and the pose's noise per sample: a slowly travelled metre is averaged
-over more poses, and the observer's gains depend on the speed. The PID is one pattern of poles per metre (`pid_gains`),
-scaled by a pace. At every speed of the grid the pace is the largest one, up to the law's own, with which the nominal
-car and every corner of the vehicle's box keep their poles in the D-region (`d_stable`) and a disk margin of at least
-`LEAST_DISK_MARGIN`. Of the observers tried, the one is taken that gives the nominal car the smallest modelled
-cross-track error (rms, worst speed of the grid).
+estimator's gains are steady-state Kalman gains: process noise per root metre and per root second, the pose's noise per
+sample, so that a slowly travelled metre is averaged over more poses and the gains depend on the speed. The PID is one
+pattern of poles per metre (`pid_gains`), scaled by a pace. At every speed of the grid the pace is the largest one, up
+to the law's own, with which the nominal car and every corner of the vehicle's box keep their poles in the D-region
+(`d_stable`) and a disk margin of at least `LEAST_DISK_MARGIN`.
 """
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.predictor import QUEUE_LENGTH
+from firmware_py.core.estimator import ODOMETRY_LENGTH
+from firmware_py.core.motion import QUEUE_LENGTH
 from sim.data_files import Vehicle
 from sim.errors import UserError
 from tools.design import model
-from tools.design.model import Complexes, Floats, Row
+from tools.design.model import Complexes, Floats, Mode, Row
 
 LAWS = ("car", "pid_ff")
 """As in the names of their tables; `pid_ff` takes each pose as it comes."""
 
-PREDICTING_LAWS = ("car",)
-"""Laws that observe, and predict to the instant at which the command acts."""
+MODES: dict[str, tuple[Mode, ...]] = {
+    "car": (Mode(predicts=True, with_yaw_rate=True), Mode(predicts=True, with_yaw_rate=False)),
+    "pid_ff": (Mode(predicts=False, with_yaw_rate=True),),
+}
+"""How each law runs; the first is the usual one."""
 
 COLUMNS = Row._fields
 
@@ -37,26 +40,43 @@ POSITION_NOISE_M = 0.01
 HEADING_NOISE_RAD = math.radians(0.1)
 """Noise of one pose, of the localisation that the design assumes."""
 
-DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
-"""What the car does by itself: noise of cross-track error (m), heading (rad) and curvature disturbance (1/m) per root
-metre of travel. The last stands for steering bias, steering gain and tyres, whose effect changes as the path bends."""
+YAW_RATE_NOISE_RADPS = math.radians(0.02)
+YAW_RATE_WALK = math.radians(0.002)
+"""Noise of a yaw rate (rad/s a sample) and walk of the gyro's bias (rad/s per root second)."""
 
-OBSERVER_PACES = (0.8, 0.65, 0.5, 0.4)
-"""Observers tried: process noise of `DISTURBANCE` with its poles moved by about these factors. Faster ones spend
-more of the steering's rate on the pose's noise and bring no smaller largest error."""
+SIDE_SLIP = 0.4e-3
+HEADING_WALK = 0.2e-3
+"""With the yaw rate: what the rear tyres' unknown slip moves the car aside (m), and what is left of heading that the
+yaw rate does not show (rad), per root metre of travel."""
+
+ROAD_WALK_1PM = 0.5e-3
+"""Change of the road disturbance per root metre: the play of the steering goes from one side to the other."""
+
+OFFSET_LENGTH_M = 2.0
+"""Way over which the steering offset is learnt: long against what an unknown lag of the steering looks like."""
+
+DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
+"""Without the yaw rate: noise of cross-track error (m), heading (rad) and road disturbance (1/m) per root metre. The
+last stands for steering bias, steering gain and tyres, whose effect changes as the path bends."""
+
+OBSERVER_PACES = (0.8, 0.65, 0.5, 0.4, 0.3)
+"""Observers tried without the yaw rate: process noise of `DISTURBANCE` with its poles moved by about these factors."""
 
 PREVIEW_S = 0.5
 """The preview distance in seconds of travel."""
 
-FASTEST_PACE = {"car": 1.25, "pid_ff": 0.65}
+FASTEST_PACE = {"car": 1.4, "pid_ff": 0.65}
 """Largest pace of the PID: above it the pose's noise costs more than the quicker answer gains. Unfiltered, that noise
 saturates the steering's rate, which no linear margin shows: twice this pace loses a 4 m wheelbase off the path."""
 
 SLOWEST_PACE = 0.3
 """Below it a start off the path would not be corrected within a leg."""
 
-LEAST_DISK_MARGIN = 0.34
-"""Of every car in the box: 1.4 times the steering gain, or 19 degrees of phase, whatever mixture of both."""
+LEAST_DISK_MARGIN = {"car": 0.6, "pid_ff": 0.34}
+"""Of every car in the box: 0.6 is 1.86 times the steering gain or 33 degrees of phase, whatever mixture of both."""
+
+LEAST_DISK_MARGIN_WITHOUT_YAW_RATE = 0.34
+"""For the rest of a run in which the yaw rate has gone missing: 1.4 times the gain or 19 degrees."""
 
 SLOWEST_POLE_1PM = -0.08
 """Every pole decays within 12 m of travel, the shorter leg."""
@@ -71,7 +91,7 @@ QUICK_1PS = 10.0
 """Poles that decay faster, within 0.1 s, belong to delay chain and lag and need no damping."""
 
 GAIN_SPREAD = 0.1
-"""Steering gain of the cars in the box, besides the wheelbase."""
+"""Steering gain of the cars in the box."""
 
 
 def pid_gains(pace: float) -> tuple[float, float, float]:
@@ -91,23 +111,60 @@ def checked_speeds(vehicle: Vehicle) -> tuple[float, ...]:
     return SPEED_GRID_MPS[1 : len(reached) + 1]
 
 
-def corners(vehicle: Vehicle) -> list[model.Corner]:
-    """The cars to survive: the nominal one, then the corners of the box in lag, latency, steering gain and wheelbase.
+def corners(vehicle: Vehicle, softest_tyres: bool = False) -> list[model.Corner]:
+    """The cars to survive: the nominal one, then the corners of the box.
 
-    Each has `model.LOOP_AGE_S` of latency besides its own. Mass and tyres do not enter: at walking speed the tyres
-    answer within a cycle or two, and what slip turns the car is the feedforward's and the disturbance's business.
+    In steering lag, latencies, steering gain, wheelbase, mass (with the yaw inertia) and cornering stiffness (both
+    axles together). With `softest_tyres` only those with the greatest mass on the softest tyres, which answer last.
     """
-    age = model.LOOP_AGE_S / model.PERIOD_S
-    pose, command = vehicle.box["pose_latency_samples"], vehicle.box["command_latency_samples"]
-    own = vehicle.pose_latency_samples + vehicle.command_latency_samples
-    cars = [model.Corner("nominal car", vehicle.steering_lag_s, own + age, 1.0)]
-    spread = (1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD)
-    latencies = (pose[0] + command[0], pose[1] + command[1])
-    for lag, latency, gain, wheelbase in itertools.product(
-        _ends(vehicle.box["steering_lag_s"]), _ends(latencies), spread, _ends(vehicle.box["wheelbase_m"])
+    nominal = model.Corner(
+        "nominal car",
+        vehicle.steering_lag_s,
+        round(vehicle.pose_latency_samples),
+        vehicle.command_latency_samples,
+        1.0,
+        vehicle.wheelbase_m,
+        vehicle.cg_to_rear_axle_m,
+        vehicle.mass_kg,
+        vehicle.yaw_inertia_kgm2,
+        vehicle.cornering_stiffness_front_n_per_rad,
+        vehicle.cornering_stiffness_rear_n_per_rad,
+    )
+    cars = [nominal]
+    box = vehicle.box
+
+    def shares(key: str, softest: int) -> tuple[float, ...]:
+        both = tuple(end / getattr(vehicle, key) for end in _ends(box[key]))
+        return both[softest : softest + 1] or both if softest_tyres else both
+
+    for lag, pose, command, gain, wheelbase, mass, stiffness in itertools.product(
+        _ends(box["steering_lag_s"]),
+        _ends(box["pose_latency_samples"]),
+        _ends(box["command_latency_samples"]),
+        (1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD),
+        _ends(box["wheelbase_m"]),
+        shares("mass_kg", 1),
+        shares("cornering_stiffness_front_n_per_rad", 0),
     ):
-        name = f"lag {lag:g} s, latency {latency:g} samples, steering gain {gain:g}, wheelbase {wheelbase:g} m"
-        cars.append(model.Corner(name, lag, latency + age, gain * vehicle.wheelbase_m / wheelbase))
+        name = (
+            f"lag {lag:g} s, latency {pose:g} + {command:g} samples, steering gain {gain:g}, wheelbase {wheelbase:g} m,"
+            f" mass {mass:.2g} and stiffness {stiffness:.2g} of nominal"
+        )
+        cars.append(
+            nominal._replace(
+                name=name,
+                steering_lag_s=lag,
+                pose_latency_samples=math.ceil(pose - 1e-9),
+                command_latency_samples=command,
+                steering_gain=gain,
+                wheelbase_m=wheelbase,
+                cg_to_rear_axle_m=nominal.cg_to_rear_axle_m * wheelbase / vehicle.wheelbase_m,
+                mass_kg=nominal.mass_kg * mass,
+                yaw_inertia_kgm2=nominal.yaw_inertia_kgm2 * mass,
+                stiffness_front_n_per_rad=nominal.stiffness_front_n_per_rad * stiffness,
+                stiffness_rear_n_per_rad=nominal.stiffness_rear_n_per_rad * stiffness,
+            )
+        )
     return cars
 
 
@@ -120,49 +177,93 @@ def _ends(interval: tuple[float, float]) -> tuple[float, ...]:
 # --------------------------------------------------------------------------------------------------------------------
 
 
-def observer_model(
-    direction: float, speed_mps: float, noise: tuple[float, float, float]
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """The observer's F (3, 3), H (2, 3), process noise (3, 3) and measurement noise (2, 2) of one cycle."""
-    f, _ = model.motion(speed_mps, direction, 0.0)
-    ds = speed_mps * model.PERIOD_S
-    return (
-        f[:3, :3],
-        np.eye(2, 3),
-        np.diag([value * value * ds for value in noise]),
-        np.diag([POSITION_NOISE_M**2, HEADING_NOISE_RAD**2]),
-    )
-
-
-@cache
-def observer_gains(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> Floats:
-    """Steady-state Kalman gains per cycle of (e, heading error, disturbance), shape (3, 2); zeros at standstill.
-
-    noise: process noise of the three per root metre of travel. The array cannot be written to.
-    """
+def _kalman(f: Floats, h: Floats, q: Floats, r: Floats) -> Floats:
+    """Steady-state Kalman gains, shape (states, measurements)."""
     from scipy.linalg import solve_discrete_are  # noqa: PLC0415  (heavy, and only the design needs it)
 
-    if speed_mps == 0.0:
-        return np.broadcast_to(0.0, (3, 2))
-    f, h, q, r = observer_model(direction, speed_mps, noise)
-    # In units of the measurement's noise: the solver is accurate where numbers are alike.
-    unit = np.array([POSITION_NOISE_M, HEADING_NOISE_RAD, HEADING_NOISE_RAD])
+    # In units of the noises: the solver is accurate where numbers are alike.
+    unit = np.array([POSITION_NOISE_M, HEADING_NOISE_RAD, max(30.0 * math.sqrt(q[2, 2]), 1e-9)])
     covariance = solve_discrete_are(
-        (f * unit / unit[:, None]).T, h.T, q / np.outer(unit, unit), r / np.outer(unit[:2], unit[:2])
+        (f * unit / unit[:, None]).T,
+        (h * unit / unit[:2, None]).T,
+        q / np.outer(unit, unit),
+        r / np.outer(unit[:2], unit[:2]),
     ) * np.outer(unit, unit)
     gains = np.asarray(covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r))
     gains.setflags(write=False)
     return gains
 
 
+POSE_NOISE = np.diag([POSITION_NOISE_M**2, HEADING_NOISE_RAD**2])
+POSE = np.eye(2, 3)
+
+
+def gyro_model(direction: float, speed_mps: float) -> tuple[Floats, Floats]:
+    """The estimator with the yaw rate: F and process noise of (cross-track error, heading error, gyro's bias)."""
+    ds, dt = speed_mps * model.PERIOD_S, model.PERIOD_S
+    f = np.array([[1.0, direction * ds, -0.5 * direction * ds * dt], [0.0, 1.0, -dt], [0.0, 0.0, 1.0]])
+    heading = HEADING_WALK**2 * ds + (YAW_RATE_NOISE_RADPS * dt) ** 2
+    return f, np.diag([SIDE_SLIP**2 * ds, heading, YAW_RATE_WALK**2 * dt])
+
+
+def steering_model(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> tuple[Floats, Floats]:
+    """The estimator without it: F and process noise of (cross-track error, heading error, road disturbance)."""
+    ds = speed_mps * model.PERIOD_S
+    turn = direction * ds
+    f = np.array([[1.0, turn, 0.5 * ds * ds], [0.0, 1.0, turn], [0.0, 0.0, 1.0]])
+    return f, np.diag([value * value * ds for value in noise])
+
+
+@cache
+def gyro_gains(direction: float, speed_mps: float) -> Floats:
+    """Kalman gains per cycle of (cross-track error, heading error, gyro's bias), shape (3, 2); zeros at standstill."""
+    if speed_mps == 0.0:
+        return np.broadcast_to(0.0, (3, 2))
+    return _kalman(gyro_model(direction, speed_mps)[0], POSE, gyro_model(direction, speed_mps)[1], POSE_NOISE)
+
+
+@cache
+def steering_gains(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> Floats:
+    """Kalman gains per cycle of (cross-track error, heading error, road disturbance), shape (3, 2)."""
+    if speed_mps == 0.0:
+        return np.broadcast_to(0.0, (3, 2))
+    f, q = steering_model(direction, speed_mps, noise)
+    return _kalman(f, POSE, q, POSE_NOISE)
+
+
+@cache
+def road_gain(direction: float, speed_mps: float) -> float:
+    """Kalman gain of the road disturbance for the gap between yaw rate and steering over a cycle, 1/m for a radian."""
+    if speed_mps == 0.0:
+        return 0.0
+    ds = direction * speed_mps * model.PERIOD_S
+    grown = ROAD_WALK_1PM**2 * abs(ds)
+    noise = (YAW_RATE_NOISE_RADPS * model.PERIOD_S) ** 2
+    # The scalar Riccati equation p = p r / (p ds^2 + r) + q, solved for its positive root.
+    variance = 0.5 * grown + math.sqrt(0.25 * grown * grown + grown * noise / (ds * ds))
+    return variance * ds / (variance * ds * ds + noise)
+
+
 def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float) -> Row:
-    """A row of the gain table; a law that takes each pose as it comes has no observer, whatever its pace."""
-    correction = np.eye(3, 2)
-    if law in PREDICTING_LAWS:
-        correction = observer_gains(direction, speed_mps, observer_noise(observer_pace))
-    kp, ki, kd = pid_gains(pid_pace)
-    l_ee, l_ep, l_pe, l_pp, l_de, l_dp = (float(value) for value in correction.reshape(-1))
-    return Row(direction, speed_mps, PREVIEW_S * speed_mps, kp, ki, kd, l_ee, l_ep, l_pe, l_pp, l_de, l_dp)
+    """A row of the gain table; a law that takes each pose as it comes estimates nothing, whatever its pace."""
+    with_yaw_rate = without = np.eye(3, 2)
+    offset = road = 0.0
+    if law == "car":
+        with_yaw_rate = gyro_gains(direction, speed_mps)
+        without = steering_gains(direction, speed_mps, observer_noise(observer_pace))
+        road = road_gain(direction, speed_mps)
+        offset = 1.0 - math.exp(-speed_mps * model.PERIOD_S / OFFSET_LENGTH_M)
+    numbers = (
+        direction,
+        speed_mps,
+        PREVIEW_S * speed_mps,
+        *pid_gains(pid_pace),
+        offset,
+        *with_yaw_rate.reshape(-1),
+        road,
+        *without.reshape(-1),
+    )
+    return Row._make(float(number) for number in numbers)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -197,38 +298,16 @@ def d_stable(matrix: Floats, speed_mps: float, least_damping: float = LEAST_DAMP
     return bool(np.all(-slow.real >= least_damping * np.abs(slow)))
 
 
-def modelled_error_m(row: Row, nominal: model.Nominal, car: model.Corner, predicts: bool) -> float:
-    """Stationary rms of the cross-track error of a stable closed loop, m.
-
-    Driven by the noise of the poses and by `DISTURBANCE`; by integration of the spectra.
-    """
-    theta = np.geomspace(1e-4 * row.speed_mps, math.pi, 400)
-    z = np.exp(1j * theta)
-    plant = model.car_response(car, row.speed_mps, row.direction, z)
-    law = model.controller_response(row, nominal, z, predicts)
-    f, _, process, measurement = observer_model(row.direction, row.speed_mps, DISTURBANCE)
-    drift = np.linalg.solve(z[:, None, None] * np.eye(3) - f, np.sqrt(process)[None])[:, :2]
-    # All five sources as the pose would show them without feedback.
-    pose = np.concatenate([drift, np.broadcast_to(np.sqrt(measurement), (len(z), 2, 2))], axis=2)
-    command = np.einsum("zi,zij->zj", law, pose) / (1.0 - np.sum(law * plant, axis=1))[:, None]
-    error = plant[:, :1] * command
-    error[:, :3] += drift[:, 0]
-    power = np.sum(np.abs(error) ** 2, axis=1)
-    area = float(np.sum(0.5 * (power[1:] + power[:-1]) * np.diff(theta)) + power[0] * theta[0])
-    return math.sqrt(area / math.pi)
-
-
 # --------------------------------------------------------------------------------------------------------------------
 # The choice
 # --------------------------------------------------------------------------------------------------------------------
 
 
 class Schedule(NamedTuple):
-    """What was chosen for a law: the observer's pace, the PID's pace at each speed, and the modelled error."""
+    """What was chosen for a law: the observer's pace without the yaw rate, and the PID's pace at each speed."""
 
     observer_pace: float
     pid_pace: tuple[float, ...]
-    cross_track_rms_m: float
 
 
 def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
@@ -236,12 +315,12 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
 
     Deterministic. Raises UserError where no gains survive the vehicle's box, naming the dimension to narrow.
     """
-    latency = model.nominal_of(vehicle).latency_samples
-    if latency >= QUEUE_LENGTH:
-        raise UserError(
-            f"vehicle {vehicle.name}: pose_latency_samples + command_latency_samples = {latency}: must be below"
-            f" {QUEUE_LENGTH}, the number of commands that the controller remembers"
-        )
+    for key, longest in (("pose_latency_samples", ODOMETRY_LENGTH - 1), ("command_latency_samples", QUEUE_LENGTH - 2)):
+        if round(getattr(vehicle, key)) > longest:
+            raise UserError(
+                f"vehicle {vehicle.name}: {key} = {getattr(vehicle, key):g}: must be at most {longest}, what the"
+                " controller remembers"
+            )
     tables: dict[str, list[tuple[float, ...]]] = {}
     for law in LAWS:
         schedule = choose(vehicle, law)
@@ -253,53 +332,74 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
     return tables
 
 
+class CarsAtSpeed(NamedTuple):
+    """The cars of a vehicle's box at one speed: their answers at the points z, and their matrices."""
+
+    cars: Sequence[model.Corner]
+    z: Complexes
+    answers: Complexes
+    plants: Sequence[model.StateSpace]
+
+
+def cars_at_speed(cars: Sequence[model.Corner], speed_mps: float, direction: float, z: Complexes) -> CarsAtSpeed:
+    """Return the cars at a speed and direction; what all laws and modes have in common."""
+    return CarsAtSpeed(
+        cars,
+        z,
+        np.stack([model.car_response(car, speed_mps, direction, z) for car in cars]),
+        [model.car(car, speed_mps, direction) for car in cars],
+    )
+
+
 def choose(vehicle: Vehicle, law: str) -> Schedule:
-    """The best schedule of a vehicle and law, by the criterion of this module."""
-    best: Schedule | None = None
-    for observer_pace in OBSERVER_PACES if law in PREDICTING_LAWS else OBSERVER_PACES[:1]:
-        schedule = _schedule(vehicle, law, observer_pace)
-        if schedule is None:
-            continue
-        if best is not None and schedule.cross_track_rms_m >= best.cross_track_rms_m:
-            break  # slower observers only lose from here on
-        best = schedule
-    if best is None:
-        raise UserError(_why_not(vehicle, model.nominal_of(vehicle), law))
-    return best
-
-
-def _schedule(vehicle: Vehicle, law: str, observer_pace: float) -> Schedule | None:
-    """The schedule with one observer; None where some speed has no gains that survive."""
-    cars = corners(vehicle)
+    """The quickest schedule of a vehicle and law whose cars all survive; UserError where there is none."""
     nominal = model.nominal_of(vehicle)
+    cars = corners(vehicle, softest_tyres=True)
     checked = checked_speeds(vehicle)
-    fastest = FASTEST_PACE[law]
+    at = {speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked}
+    usual, *others = MODES[law]
     paces: list[float] = []
-    worst = 0.0
     # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
     for speed in reversed(checked):
 
         def survives(pace: float, speed: float = speed) -> bool:
-            return _survives(row_of(law, 1.0, speed, pace, observer_pace), nominal, cars, law in PREDICTING_LAWS)
+            row = row_of(law, 1.0, speed, pace, OBSERVER_PACES[0])
+            return _survives(row, nominal, usual, at[speed], LEAST_DISK_MARGIN[law])
 
-        pace = _largest(survives, SLOWEST_PACE, fastest)
+        pace = _largest(survives, SLOWEST_PACE, FASTEST_PACE[law])
         if pace is None:
-            return None
+            raise UserError(_why_not(vehicle, nominal, law))
         paces.append(pace)
-        chosen = row_of(law, 1.0, speed, pace, observer_pace)
-        worst = max(worst, modelled_error_m(chosen, nominal, cars[0], law in PREDICTING_LAWS))
+    paces.reverse()
+    observer_pace = OBSERVER_PACES[0]
+    for mode in others:
+        observer_pace = next(
+            (
+                tried
+                for tried in OBSERVER_PACES
+                if all(
+                    _survives(
+                        row_of(law, 1.0, speed, pace, tried),
+                        nominal,
+                        mode,
+                        at[speed],
+                        LEAST_DISK_MARGIN_WITHOUT_YAW_RATE,
+                    )
+                    for speed, pace in zip(reversed(checked), reversed(paces), strict=True)
+                )
+            ),
+            OBSERVER_PACES[-1],
+        )
     beyond = len(SPEED_GRID_MPS) - 1 - len(checked)
-    by_speed = (paces[-1], *reversed(paces), *(paces[0],) * beyond)
-    return Schedule(observer_pace, by_speed, worst)
+    return Schedule(observer_pace, (paces[0], *paces, *(paces[-1],) * beyond))
 
 
-def _survives(row: Row, nominal: model.Nominal, cars: list[model.Corner], predicts: bool) -> bool:
-    z = on_circle(frequencies(row.speed_mps))
-    loops = model.loop_response(row, nominal, cars, z, predicts)
-    if float(disk_margin(loops).min()) < LEAST_DISK_MARGIN:
+def _survives(row: Row, nominal: model.Nominal, mode: Mode, at: CarsAtSpeed, least_disk_margin: float) -> bool:
+    law = model.controller(row, nominal, mode)
+    if float(disk_margin(model.loops(law, at.answers, at.z)).min()) < least_disk_margin:
         return False
     least_damping = BLEND_RESERVE * LEAST_DAMPING
-    return all(d_stable(model.closed_loop(row, nominal, car, predicts), row.speed_mps, least_damping) for car in cars)
+    return all(d_stable(model.closed_loop(law, plant), row.speed_mps, least_damping) for plant in at.plants)
 
 
 def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int = 7) -> float | None:
@@ -322,25 +422,28 @@ def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
     speed = checked_speeds(vehicle)[-1]
     row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1])
     z = on_circle(frequencies(speed))
+    system = model.controller(row, nominal, MODES[law][0])
 
     def margin(car: model.Corner) -> float:
-        if not d_stable(model.closed_loop(row, nominal, car, law in PREDICTING_LAWS), speed):
+        if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed):
             return 0.0
-        return float(disk_margin(model.loop_response(row, nominal, [car], z, law in PREDICTING_LAWS))[0])
+        return float(disk_margin(model.loop_response(system, row, [car], z))[0])
 
-    cars = corners(vehicle)
+    cars = corners(vehicle, softest_tyres=True)
     worst = min(cars, key=margin)
     # The dimension that helps most when it alone is nominal; where none helps enough, when it alone does not delay.
     blamed = _dimension_that_helps(worst, cars[0], margin)
-    if blamed[0] < LEAST_DISK_MARGIN:
-        blamed = _dimension_that_helps(worst, model.Corner("", 0.0, 0.0, 1.0), margin)
+    least = LEAST_DISK_MARGIN[law]
+    if blamed[0] < least:
+        ideal = cars[0]._replace(steering_lag_s=0.0, pose_latency_samples=0, command_latency_samples=0.0)
+        blamed = _dimension_that_helps(worst, ideal, margin)
     keys = blamed[1]
     own, low, high = (
         sum(values) for values in zip(*((getattr(vehicle, key), *vehicle.box[key]) for key in keys), strict=True)
     )
     return (
         f"vehicle {vehicle.name}: {' + '.join(keys)} = {own:g} ({low:g} to {high:g}): no gains of law {law} keep a disk"
-        f" margin of {LEAST_DISK_MARGIN:g} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
+        f" margin of {least:g} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
     )
 
 
@@ -348,11 +451,12 @@ def _dimension_that_helps(
     car: model.Corner, home: model.Corner, margin: Callable[[model.Corner], float]
 ) -> tuple[float, tuple[str, ...]]:
     """The largest margin of a car with one dimension taken from `home`, and that dimension's keys in the file."""
-    only_steering = max(min(car.gain, 1.0 + GAIN_SPREAD), 1.0 - GAIN_SPREAD)
     trials = {
         ("steering_lag_s",): car._replace(steering_lag_s=home.steering_lag_s),
-        ("pose_latency_samples", "command_latency_samples"): car._replace(latency_samples=home.latency_samples),
-        ("wheelbase_m",): car._replace(gain=only_steering),
+        ("pose_latency_samples", "command_latency_samples"): car._replace(
+            pose_latency_samples=home.pose_latency_samples, command_latency_samples=home.command_latency_samples
+        ),
+        ("wheelbase_m",): car._replace(wheelbase_m=home.wheelbase_m, cg_to_rear_axle_m=home.cg_to_rear_axle_m),
     }
     margins = {keys: margin(trial) for keys, trial in trials.items()}
     best = max(margins, key=lambda keys: margins[keys])

@@ -1,17 +1,13 @@
 """The sampled steering loop as matrices: the car, the controller as the firmware runs it, and the loop they close.
 
-Everything is linear about a straight path at a constant speed. Angles stand for the curvatures that they make
-(tan(angle) / wheelbase), so that the loop hardly depends on the wheelbase. Where the loop is cut for the margins is the
-steering command on its way to the car: what the controller remembers as sent stays inside the controller.
+Everything is linear about a straight path at a constant speed. The controller's matrices are those of the firmware's
+own functions (`firmware_py.core`: estimator, predictor, PID, disturbances), taken by differences, so that observer,
+predictor and remembered commands are in them as they run; limits are not reached. The car is a single-track model with
+linear tyres behind a lagging steering with dead time, sampled exactly.
 
-One cycle of the controller, with y = (cross-track error, heading error) of the newest pose:
-
-    x  <- F x + G u[k-1-n];  x <- x + L (y - H x)      observer, n = nominal latency of pose and command
-    xp  = F^n x + sum F^i G u[k-1-i]                   predictor, to the instant at which this command acts
-    u   = -(kp (e + sigma p h) + sigma kd h + ki I + d);  I <- I + (e + sigma p h) ds
-
-with x = (e, h, d, c): cross-track error, heading error, curvature disturbance, and the curvature of the wheels behind
-their lag. F and G are `firmware_py.core.motion.advance`, linearised; the tests hold both against each other.
+Where the loop is cut for the margins is the steering command on its way to the car: what the controller remembers as
+sent stays inside the controller. A cycle begins with the vehicle's reports; the pose in them is older by its latency,
+and the command that they lead to acts LOOP_AGE_S and the command's latency after them.
 """
 
 import math
@@ -21,6 +17,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from firmware_py.core import estimator, pid, predictor
+from firmware_py.core.motion import QUEUE_LENGTH, lag_weights
+from firmware_py.core.schedule import gains_at
+from firmware_py.core.tables import CarTable, GainTable, LegTable
 from sim.data_files import Vehicle
 
 Floats = npt.NDArray[np.float64]
@@ -31,13 +31,17 @@ PERIOD_S = 0.01
 
 LOOP_AGE_S = 0.0035
 """Latency of every loop besides the car's own: reports are 3 ms old when a cycle begins and its commands leave 0.5 ms
-after it. The law has no model of it, so it counts as part of what the design must survive."""
+after it."""
 
-STATES = 4  # of the observer: e, heading error, disturbance, curvature of the wheels
+LEAST_LAG_S = 1e-3
+"""A steering quicker than this is taken to have this lag."""
+
+OUTPUTS = 4
+"""Of the car: cross-track error (m) and heading (rad) of the pose, yaw rate (rad/s), measured angle (rad)."""
 
 
 class Row(NamedTuple):
-    """One row of a gain table, in the order and units of its columns (`tools.design.gains.COLUMNS`)."""
+    """One row of a gain table, in the order and units of its columns (`firmware_py.core.schedule.Gains`)."""
 
     direction: float
     speed_mps: float
@@ -45,28 +49,52 @@ class Row(NamedTuple):
     kp: float
     ki: float
     kd: float
+    l_o: float
     l_ee: float
     l_ep: float
     l_pe: float
     l_pp: float
-    l_de: float
-    l_dp: float
+    l_be: float
+    l_bp: float
+    l_dr: float
+    m_ee: float
+    m_ep: float
+    m_pe: float
+    m_pp: float
+    m_de: float
+    m_dp: float
 
 
 class Nominal(NamedTuple):
-    """What the controller believes of the car: lag in s, latency of pose and command in whole samples."""
+    """What the controller believes of the car: wheelbase in m, lag in s, latencies in whole samples."""
 
+    wheelbase_m: float
     steering_lag_s: float
-    latency_samples: int
+    pose_latency_samples: int
+    command_latency_samples: int
 
 
 class Corner(NamedTuple):
-    """A car that may come true. gain: curvature that it makes over the curvature that was commanded."""
+    """A car that may come true; `steering_gain` is the angle that it makes over the angle that was commanded."""
 
     name: str
     steering_lag_s: float
-    latency_samples: float
-    gain: float
+    pose_latency_samples: int
+    command_latency_samples: float
+    steering_gain: float
+    wheelbase_m: float
+    cg_to_rear_axle_m: float
+    mass_kg: float
+    yaw_inertia_kgm2: float
+    stiffness_front_n_per_rad: float
+    stiffness_rear_n_per_rad: float
+
+
+class Mode(NamedTuple):
+    """How the controller runs: predicting or not (`pid+ff`), with a fresh yaw rate or without."""
+
+    predicts: bool = True
+    with_yaw_rate: bool = True
 
 
 class StateSpace(NamedTuple):
@@ -80,7 +108,12 @@ class StateSpace(NamedTuple):
 
 def nominal_of(vehicle: Vehicle) -> Nominal:
     """What the controller is told of a vehicle; its latencies are rounded to whole cycles."""
-    return Nominal(vehicle.steering_lag_s, round(vehicle.pose_latency_samples) + round(vehicle.command_latency_samples))
+    return Nominal(
+        vehicle.wheelbase_m,
+        vehicle.steering_lag_s,
+        round(vehicle.pose_latency_samples),
+        round(vehicle.command_latency_samples),
+    )
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -88,176 +121,264 @@ def nominal_of(vehicle: Vehicle) -> Nominal:
 # --------------------------------------------------------------------------------------------------------------------
 
 
-def _held(speed_mps: float, sigma: float, lag_s: float, time_s: float) -> tuple[Floats, Floats]:
-    """Exact motion over `time_s` with the command held: matrix (3, 3) on (e, heading error, c) and vector (3,)."""
-    ds = speed_mps * time_s
-    if lag_s > 0.0:
-        decay = math.exp(-time_s / lag_s)
-        # Distances that the wheels' own curvature works over, once and twice integrated.
-        once = speed_mps * lag_s * (1.0 - decay)
-        twice = speed_mps * lag_s * (ds - once)
-    else:
-        decay = once = twice = 0.0
-    a = np.array([[1.0, sigma * ds, twice], [0.0, 1.0, sigma * once], [0.0, 0.0, decay]])
-    b = np.array([0.5 * ds * ds - twice, sigma * (ds - once), 1.0 - decay])
-    return a, b
+def _held(corner: Corner, velocity_mps: float, time_s: float) -> tuple[Floats, Floats]:
+    """Exact motion over `time_s` with the command held: matrix (5, 5) and vector (5,).
 
-
-def car(corner: Corner, speed_mps: float, sigma: float) -> StateSpace:
-    """From the commanded curvature to (e, heading error) of the newest pose; exact, latency need not be whole.
-
-    State: (e, heading error, c) at the pose's instant, then the commands on their way, newest first.
+    State: place of the rear axle to the left (m), yaw (rad), lateral velocity of the centre of gravity (m/s), yaw rate
+    (rad/s), road-wheel angle (rad). In reverse the velocity is negative and the tyres still push against their slip.
     """
-    latency = corner.latency_samples
+    from scipy.linalg import expm  # noqa: PLC0415  (heavy, and only the design needs it)
+
+    rear = corner.cg_to_rear_axle_m
+    front = corner.wheelbase_m - rear
+    mass, inertia = corner.mass_kg, corner.yaw_inertia_kgm2
+    v, pace = velocity_mps, abs(velocity_mps)
+    cf, cr = corner.stiffness_front_n_per_rad / pace, corner.stiffness_rear_n_per_rad / pace
+    lag = max(corner.steering_lag_s, LEAST_LAG_S)
+    system = np.zeros((6, 6))
+    system[0, 1:4] = v, 1.0, -rear
+    system[1, 3] = 1.0
+    system[2, 2:5] = -(cf + cr) / mass, -(cf * front - cr * rear) / mass - v, cf * v / mass
+    system[3, 2:5] = (
+        -(cf * front - cr * rear) / inertia,
+        -(cf * front * front + cr * rear * rear) / inertia,
+        cf * front * v / inertia,
+    )
+    system[4, 4] = -1.0 / lag
+    system[4, 5] = corner.steering_gain / lag
+    both = expm(system * time_s)
+    return both[:5, :5], both[:5, 5]
+
+
+class _Sampled(NamedTuple):
+    """The car over one cycle: x' = a x + newer u[k - whole] + older u[k - whole - 1]."""
+
+    a: Floats
+    newer: Floats
+    older: Floats
+    whole: int
+
+
+def _sampled(corner: Corner, velocity_mps: float) -> _Sampled:
+    latency = corner.command_latency_samples + LOOP_AGE_S / PERIOD_S
     whole = math.floor(latency + 1e-9)
     part = max(latency - whole, 0.0)
-    late, late_b = _held(speed_mps, sigma, corner.steering_lag_s, (1.0 - part) * PERIOD_S)
-    early, early_b = _held(speed_mps, sigma, corner.steering_lag_s, part * PERIOD_S)
-    waiting = whole + 1 if part > 1e-9 else whole
-    size = 3 + waiting
+    late, late_b = _held(corner, velocity_mps, (1.0 - part) * PERIOD_S)
+    early, early_b = _held(corner, velocity_mps, part * PERIOD_S)
+    return _Sampled(late @ early, late_b, late @ early_b, whole)
+
+
+def car(corner: Corner, speed_mps: float, direction: float) -> StateSpace:
+    """From the commanded angle (rad) to what the reports say, `OUTPUTS` of them.
+
+    State: the five of the car, the poses on their way, newest first, then the commands on their way, newest first.
+    """
+    sampled = _sampled(corner, direction * speed_mps)
+    poses, waiting = corner.pose_latency_samples, sampled.whole + 1
+    size = 5 + 2 * poses + waiting
+    line = 5 + 2 * poses
     a = np.zeros((size, size))
     b = np.zeros((size, 1))
-    a[:3, :3] = late @ early
-    for index, effect in ((whole, late_b), (whole + 1, late @ early_b)):
-        if index == 0:
-            b[:3, 0] += corner.gain * effect
-        elif index <= waiting:
-            a[:3, 2 + index] += corner.gain * effect
-    if waiting:
-        b[3, 0] = 1.0
-        a[4:, 3:-1] = np.eye(waiting - 1)
-    return StateSpace(a, b, np.eye(2, size), np.zeros((2, 1)))
+    a[:5, :5] = sampled.a
+    for index in range(poses):
+        at = 5 + 2 * index
+        before = 0 if index == 0 else at - 2
+        a[at : at + 2, before : before + 2] = np.eye(2)
+    if sampled.whole == 0:
+        b[:5, 0] = sampled.newer
+    else:
+        a[:5, line + sampled.whole - 1] = sampled.newer
+    a[:5, line + sampled.whole] += sampled.older
+    b[line, 0] = 1.0
+    a[line + 1 :, line:-1] = np.eye(waiting - 1)
+    c = np.zeros((OUTPUTS, size))
+    pose = 0 if poses == 0 else 5 + 2 * (poses - 1)
+    c[0, pose] = c[1, pose + 1] = c[2, 3] = c[3, 4] = 1.0
+    return StateSpace(a, b, c, np.zeros((OUTPUTS, 1)))
 
 
-def car_response(corner: Corner, speed_mps: float, sigma: float, z: Complexes) -> Complexes:
-    """Frequency response of `car` at the points z, shape (len(z), 2)."""
-    latency = corner.latency_samples
-    whole = math.floor(latency + 1e-9)
-    part = max(latency - whole, 0.0)
-    late, late_b = _held(speed_mps, sigma, corner.steering_lag_s, (1.0 - part) * PERIOD_S)
-    early, early_b = _held(speed_mps, sigma, corner.steering_lag_s, part * PERIOD_S)
-    drive = late_b + np.outer(1.0 / z, late @ early_b) * (part > 1e-9)
-    matrix = z[:, None, None] * np.eye(3) - late @ early
-    state = np.linalg.solve(matrix, drive[:, :, None])[:, :, 0]
-    return np.asarray(corner.gain * (z**-whole)[:, None] * state[:, :2])
+def car_response(corner: Corner, speed_mps: float, direction: float, z: Complexes) -> Complexes:
+    """Frequency response of `car` at the points z, shape (len(z), OUTPUTS)."""
+    sampled = _sampled(corner, direction * speed_mps)
+    drive = (sampled.newer + np.outer(1.0 / z, sampled.older)) * (z**-sampled.whole)[:, None]
+    state = np.linalg.solve(z[:, None, None] * np.eye(5) - sampled.a, drive[:, :, None])[:, :, 0]
+    late = z**-corner.pose_latency_samples
+    return np.stack([late * state[:, 0], late * state[:, 1], state[:, 3], state[:, 4]], axis=1)
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # The controller
 # --------------------------------------------------------------------------------------------------------------------
 
+_STATION_M = 500.0
+_TINY = 1e-4
 
-def motion(speed_mps: float, sigma: float, lag_s: float) -> tuple[Floats, Floats]:
-    """Observer's and predictor's model of one cycle: F (4, 4) and G (4,) on (e, heading error, d, c)."""
-    ds = speed_mps * PERIOD_S
-    alpha, own_share = 1.0, 0.0
-    if lag_s > 0.0:
-        alpha = 1.0 - math.exp(-PERIOD_S / lag_s)
-        own_share = lag_s / PERIOD_S * alpha
-    turn = sigma * ds
-    half = 0.5 * ds * ds
-    f = np.array(
-        [
-            [1.0, turn, half, half * own_share],
-            [0.0, 1.0, turn, turn * own_share],
-            [0.0, 0.0, 1.0, 0.0],
-            [0.0, 0.0, 0.0, 1.0 - alpha],
-        ]
+
+def straight_leg(direction: float) -> LegTable:
+    """A leg of 1000 m along x, driven with yaw 0, forward or backwards."""
+    length = 2.0 * _STATION_M
+    zero = (0.0, 0.0)
+    return LegTable(
+        sigma=direction,
+        step_m=length,
+        length_m=length,
+        last_row=1,
+        x_m=(0.0, length) if direction > 0.0 else (length, 0.0),
+        y_m=zero,
+        yaw_rad=zero,
+        slip_heading_rad=zero,
+        slip_curvature_1pm=zero,
+        feedforward_curvature_1pm=zero,
+        feedforward_slope_1pm2=zero,
+        speed_mps=(1.0, 1.0),
+        accel_mps2=zero,
     )
-    g = np.array([half * (1.0 - own_share), turn * (1.0 - own_share), 0.0, alpha])
-    return f, g
 
 
-class _Parts(NamedTuple):
-    """The pieces of one controller that both of its forms are built from."""
-
-    f: Floats
-    g: Floats
-    correction: Floats  # (4, 2)
-    kept: Floats  # I - L H
-    ahead: Floats  # F^n
-    ahead_g: Floats  # (n, 4): F^i G of the i-th newest command
-    preview: Floats  # row that gives the preview error
-    feedback: Floats  # row that gives the curvature to take away, without the integral
-    ds_m: float
-
-
-def _parts(row: Row, nominal: Nominal, predicts: bool) -> _Parts:
-    f, g = motion(row.speed_mps, row.direction, nominal.steering_lag_s)
-    correction = np.array([[row.l_ee, row.l_ep], [row.l_pe, row.l_pp], [row.l_de, row.l_dp], [0.0, 0.0]])
-    steps = nominal.latency_samples if predicts else 0
-    ahead = np.eye(STATES)
-    ahead_g = np.zeros((steps, STATES))
-    for index in range(steps):
-        ahead_g[index] = ahead @ g
-        ahead = f @ ahead
-    preview = np.array([1.0, row.direction * row.preview_m, 0.0, 0.0])
-    feedback = row.kp * preview + np.array([0.0, row.direction * row.kd, 1.0, 0.0])
-    kept = np.eye(STATES) - correction @ np.eye(2, STATES)
-    return _Parts(f, g, correction, kept, ahead, ahead_g, preview, feedback, row.speed_mps * PERIOD_S)
+def nominal_car(nominal: Nominal) -> CarTable:
+    """The firmware's table of a nominal car whose limits are out of the way."""
+    lag = nominal.steering_lag_s
+    alpha, mean_weight, late_weight = lag_weights(lag, PERIOD_S)
+    return CarTable(
+        wheelbase_m=nominal.wheelbase_m,
+        steering_lag_s=lag,
+        lag_alpha=alpha,
+        lag_mean_weight=mean_weight,
+        late_weight=late_weight,
+        pose_latency_samples=nominal.pose_latency_samples,
+        command_latency_samples=nominal.command_latency_samples,
+        drive_lag_s=0.3,
+        brake_lag_s=0.1,
+        gear_change_s=0.5,
+        max_road_wheel_angle_rad=1.0,
+        max_road_wheel_rate_radps=100.0,
+        max_speed_mps=10.0,
+        controlled_decel_mps2=1.0,
+        emergency_decel_mps2=2.4,
+    )
 
 
-def controller(row: Row, nominal: Nominal, predicts: bool = True) -> StateSpace:
-    """From (e, heading error) of the newest pose to the commanded curvature, as the firmware runs it.
+class _Cycle:
+    """One cycle of the firmware's law on a straight leg at constant speed, as a function of flat numbers.
 
-    State: the observer's (e, heading error, d, c), the commands sent, newest first, and the integral where ki > 0. A
-    disturbance that nothing corrects is no state of the loop and is left out.
+    State: place, yaw, road disturbance, steering offset, gyro's bias, road-wheel angle, modelled angle, last yaw rate,
+    the way gone of the last cycles (place, then yaw, relative to now), the commands sent, the integral.
     """
-    p = _parts(row, nominal, predicts)
-    sent = nominal.latency_samples + 1
-    integral = STATES + sent
-    size = integral + 1
-    # Observer's state and predicted state as rows over (controller's state), and over y.
-    seen = np.zeros((STATES, size))
-    seen[:, :STATES] = p.kept @ p.f
-    seen[:, STATES + sent - 1] = p.kept @ p.g
-    ahead = p.ahead @ seen
-    for index, effect in enumerate(p.ahead_g):
-        ahead[:, STATES + index] += effect
-    ahead_y = p.ahead @ p.correction
-    command = -p.feedback @ ahead
-    command[integral] = -row.ki
-    command_y = -p.feedback @ ahead_y
-    a = np.zeros((size, size))
-    b = np.zeros((size, 2))
-    a[:STATES] = seen
-    b[:STATES] = p.correction
-    a[STATES] = command
-    b[STATES] = command_y
-    a[STATES + 1 : integral, STATES : integral - 1] = np.eye(sent - 1)
-    a[integral] = p.ds_m * (p.preview @ ahead)
-    a[integral, integral] += 1.0
-    b[integral] = p.ds_m * (p.preview @ ahead_y)
-    keep = [index for index in range(size) if not _idle(index, integral, row)]
-    return StateSpace(a[np.ix_(keep, keep)], b[keep], command[None, keep], command_y[None, :])
+
+    def __init__(self, row: Row, nominal: Nominal, mode: Mode) -> None:
+        self.leg = straight_leg(row.direction)
+        self.car = nominal_car(nominal)
+        self.mode = mode
+        self.speed_mps = row.speed_mps
+        table = GainTable((row.speed_mps, row.speed_mps + 1.0), 1, ((row[2:], row[2:]),) * 2)
+        self.gains = gains_at(table, 0, row.speed_mps, int(mode.with_yaw_rate))
+        self.memory = nominal.pose_latency_samples if mode.predicts else 0
+        self.sent = nominal.command_latency_samples + 2
+        self.size = 8 + 2 * self.memory + self.sent + 1
+
+    def __call__(self, state: Floats, report: Floats) -> tuple[Floats, float]:
+        """Next state and command (rad) from a state and a report, `OUTPUTS` numbers."""
+        leg, car, sigma = self.leg, self.car, self.leg.sigma
+        ds_m = self.speed_mps * PERIOD_S
+        n = self.memory
+        y, yaw, road, offset, bias, angle, modelled, yaw_rate = (float(v) for v in state[:8])
+        rest = [float(v) for v in state[8:]]
+        way_y, way_yaw, sent, integral = rest[:n], rest[n : 2 * n], rest[2 * n : -1], rest[-1]
+        way = estimator.ODOMETRY_LENGTH
+        believed = estimator.begin()._replace(
+            x_m=_STATION_M,
+            y_m=y,
+            yaw_rad=yaw,
+            station_m=_STATION_M,
+            road_disturbance_rad=road,
+            steering_offset_rad=offset,
+            gyro_bias_radps=bias,
+            road_wheel_angle_rad=angle,
+            modelled_angle_rad=modelled,
+            yaw_rate_radps=yaw_rate,
+            odometry_y_m=(0.0, *way_y, *(0.0,) * (way - 1 - n)),
+            odometry_yaw_rad=(0.0, *way_yaw, *(0.0,) * (way - 1 - n)),
+        )
+        # The command that acts between two reports, as the controller has it.
+        oldest = len(sent) - 1
+        acted = sent[oldest - 1] + car.late_weight * (sent[oldest] - sent[oldest - 1])
+        motion = estimator.Motion(
+            ds_m, PERIOD_S, acted, float(report[3]), 1, float(report[2]), int(self.mode.with_yaw_rate), 0, 1
+        )
+        body_m = sigma * ds_m
+        seen = estimator.estimate(
+            leg,
+            car,
+            self.gains,
+            believed,
+            motion,
+            1,
+            _STATION_M + (body_m if n == 0 else 0.0),
+            float(report[0]),
+            float(report[1]),
+            n,
+        )
+        assert seen.disbelieved == 0
+        queue = (*sent, *(0.0,) * (QUEUE_LENGTH - len(sent)))
+        _, cross_m, heading_rad = predictor.predict(leg, car, seen, queue, self.speed_mps, PERIOD_S)
+        if not self.mode.predicts:
+            cross_m, heading_rad = seen.cross_track_error_m, seen.heading_error_rad
+        feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral, self.gains, sigma)
+        command = math.atan(-car.wheelbase_m * feedback_1pm) - seen.road_disturbance_rad - seen.steering_offset_rad
+        preview_m = pid.preview_error_m(cross_m, heading_rad, self.gains.preview_m, sigma)
+        integral = pid.integrate_m2(integral, preview_m, ds_m, self.gains, 0)
+        odometry_y, odometry_yaw = seen.odometry_y_m, seen.odometry_yaw_rad
+        after = [
+            seen.y_m,
+            seen.yaw_rad,
+            seen.road_disturbance_rad,
+            seen.steering_offset_rad,
+            seen.gyro_bias_radps,
+            seen.road_wheel_angle_rad,
+            seen.modelled_angle_rad,
+            seen.yaw_rate_radps,
+            *(odometry_y[i] - odometry_y[0] for i in range(1, n + 1)),
+            *(odometry_yaw[i] - odometry_yaw[0] for i in range(1, n + 1)),
+            command,
+            *sent[:-1],
+            integral,
+        ]
+        return np.array(after), command
 
 
-def _idle(index: int, integral: int, row: Row) -> bool:
-    """Whether a state of the controller takes no part: its integrator would count as a pole that never decays."""
-    if index == integral:
-        return row.ki == 0.0
-    return index == 2 and row.l_de == 0.0 and row.l_dp == 0.0
+def controller(row: Row, nominal: Nominal, mode: Mode = Mode()) -> StateSpace:  # noqa: B008  (immutable)
+    """From a report (`OUTPUTS`) to the commanded angle, rad, as the firmware runs it; linear by central differences.
+
+    A state that nothing changes and that keeps its value, like an integral without gain, is no state of the loop and is
+    left out.
+    """
+    cycle = _Cycle(row, nominal, mode)
+    size = cycle.size
+    columns = np.zeros((size + 1, size + OUTPUTS))
+    for index in range(size + OUTPUTS):
+        point = np.zeros(size + OUTPUTS)
+        point[index] = _TINY
+        ahead, command = cycle(point[:size], point[size:])
+        behind, command_behind = cycle(-point[:size], -point[size:])
+        columns[:size, index] = (ahead - behind) / (2.0 * _TINY)
+        columns[size, index] = (command - command_behind) / (2.0 * _TINY)
+    columns[np.abs(columns) < 1e-13] = 0.0
+    idle = [index for index in range(size) if columns[index, index] == 1.0 and np.count_nonzero(columns[index]) == 1]
+    keep = [index for index in range(size) if index not in idle]
+    return StateSpace(
+        columns[np.ix_(keep, keep)],
+        columns[np.ix_(keep, range(size, size + OUTPUTS))],
+        columns[np.ix_([size], keep)],
+        columns[size:, size:],
+    )
 
 
-def controller_response(row: Row, nominal: Nominal, z: Complexes, predicts: bool = True) -> Complexes:
-    """Frequency response of `controller` at the points z, shape (len(z), 2)."""
-    p = _parts(row, nominal, predicts)
-    delayed = z ** -(nominal.latency_samples + 1)
-    matrix = np.eye(STATES) - (p.kept @ p.f) / z[:, None, None]
-    drive = np.empty((len(z), STATES, 3), dtype=np.complex128)
-    drive[:, :, :2] = p.correction
-    drive[:, :, 2] = delayed[:, None] * (p.kept @ p.g)
-    if row.l_de == 0.0 and row.l_dp == 0.0:
-        # The idle disturbance's row is 0 = 0 at z = 1 only; keep it solvable there.
-        matrix[:, 2, 2] = 1.0
-    seen = np.linalg.solve(matrix, drive)
-    ahead = p.ahead @ seen
-    if len(p.ahead_g):
-        powers = z[:, None] ** -np.arange(1, len(p.ahead_g) + 1)
-        ahead[:, :, 2] += powers @ p.ahead_g
-    gain = p.feedback + np.outer(row.ki * p.ds_m / (z - 1.0), p.preview)
-    effect = np.einsum("zi,zij->zj", gain, ahead)
-    return np.asarray(-effect[:, :2] / (1.0 + effect[:, 2:]))
+def response(system: StateSpace, z: Complexes) -> Complexes:
+    """Frequency response of a system at the points z, shape (len(z), outputs, inputs)."""
+    state = np.linalg.solve(
+        z[:, None, None] * np.eye(len(system.a)) - system.a, np.broadcast_to(system.b, (len(z), *system.b.shape))
+    )
+    return np.asarray(system.c @ state + system.d)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -265,13 +386,11 @@ def controller_response(row: Row, nominal: Nominal, z: Complexes, predicts: bool
 # --------------------------------------------------------------------------------------------------------------------
 
 
-def open_loop(row: Row, nominal: Nominal, corner: Corner, predicts: bool = True) -> StateSpace:
+def open_loop(law: StateSpace, plant: StateSpace) -> StateSpace:
     """The loop cut at the steering command, from the command that the car gets to minus the one that comes back.
 
     Negative feedback: the loop is closed by u = -y, its characteristic is 1 + L.
     """
-    plant = car(corner, row.speed_mps, row.direction)
-    law = controller(row, nominal, predicts)
     n, m = len(plant.a), len(law.a)
     a = np.zeros((n + m, n + m))
     a[:n, :n] = plant.a
@@ -282,20 +401,20 @@ def open_loop(row: Row, nominal: Nominal, corner: Corner, predicts: bool = True)
     return StateSpace(a, b, c, np.zeros((1, 1)))
 
 
-def closed_loop(row: Row, nominal: Nominal, corner: Corner, predicts: bool = True) -> Floats:
+def closed_loop(law: StateSpace, plant: StateSpace) -> Floats:
     """State matrix of the closed loop."""
-    loop = open_loop(row, nominal, corner, predicts)
+    loop = open_loop(law, plant)
     return np.asarray(loop.a - loop.b @ loop.c)
 
 
-def loop_response(
-    row: Row, nominal: Nominal, corners: Sequence[Corner], z: Complexes, predicts: bool = True
-) -> Complexes:
-    """L of `open_loop` at the points z for several cars under one controller, shape (len(corners), len(z))."""
-    law = controller_response(row, nominal, z, predicts)
-    return np.stack(
-        [-np.sum(law * car_response(corner, row.speed_mps, row.direction, z), axis=1) for corner in corners]
-    )
+def loops(law: StateSpace, answers: Complexes, z: Complexes) -> Complexes:
+    """L of `open_loop` at the points z, shape (cars, len(z)), for cars whose `car_response` is given."""
+    return np.asarray(-np.sum(response(law, z)[:, 0, :] * answers, axis=-1))
+
+
+def loop_response(law: StateSpace, row: Row, corners: Sequence[Corner], z: Complexes) -> Complexes:
+    """The same for several cars under one controller, shape (len(corners), len(z))."""
+    return loops(law, np.stack([car_response(corner, row.speed_mps, row.direction, z) for corner in corners]), z)
 
 
 def is_stable(matrix: Floats) -> bool:

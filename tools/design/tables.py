@@ -213,6 +213,7 @@ def _car_text(vehicle: Vehicle) -> str:
         "yaw_inertia_kgm2",
         "cornering_stiffness_front_n_per_rad",
         "cornering_stiffness_rear_n_per_rad",
+        "relaxation_length_m",
         "steering_lag_s",
         "drive_lag_s",
         "brake_lag_s",
