@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim.errors import UserError
-from tools.design.parameter_space.admissible import CELLS, AdmissibleRegion, Case, admissible_region, checked_case
+from tools.design.parameter_space.admissible import CELLS, Case, admissible_region, checked_case
 from tools.design.parameter_space.boundaries import Window
 from tools.design.parameter_space.d_region import DRegion
 from tools.design.parameter_space.loop import Characteristic, Floats, Pid, Plane, characteristic, plant_of
@@ -74,8 +74,8 @@ def explorer_page(
     plant_at: called with a speed alone, for the nominal plant, and for each corner of `box` and each of `corners` with
     its values as keywords. For one plant: `lambda _: plant` with one speed. region: where the sliders
     start; with `sigma_per_metre` its sigma counts per metre of travel (1/m), so that it scales with the speed. windows,
-    points: by the plane's name; without them they are looked for at the first region. Raises UserError as
-    `admissible_region` does, and where a plane is shown twice.
+    points: by the plane's name; without them they are looked for at the first region, which must then have admissible
+    gains. Raises UserError as `admissible_region` does.
     """
     if not planes or len(speeds_mps) < 1:
         raise UserError("explorer: at least one plane and one speed are needed")
@@ -93,13 +93,12 @@ def explorer_page(
             checked_case(case)
         of_start = [case for case in cases if case.region == at_speed(region, speeds_mps[start], sigma_per_metre)]
         of_start = of_start if sigma_per_metre else [Case(n, one, region) for n, one in loops[start]]
-        window = (windows or {}).get(plane.name)
-        found = admissible_region(of_start, plane, window, cells=CELLS)
-        point = (points or {}).get(plane.name)
-        if point is None:
+        window, point = (windows or {}).get(plane.name), (points or {}).get(plane.name)
+        if window is None or point is None:
+            found = admissible_region(of_start, plane, window, cells=CELLS)
             chosen = found.choose("centre")
-            point = chosen.x, chosen.y
-        content.append(_plane_content(found, loops, region, point, cells, units))
+            window, point = found.window, point or (chosen.x, chosen.y)
+        content.append(_plane_content(plane, window, loops, region, point, cells, units))
     sigmas = [plane["sigma_best"] / (speeds_mps[start] if sigma_per_metre else 1.0) for plane in content]
     sigma_max = 4.0 * region.sigma_radps if region.sigma_radps else max(sigmas)
     radii = [plane["radius_range"] for plane in content]
@@ -160,14 +159,14 @@ def _loops(
 
 
 def _plane_content(
-    found: AdmissibleRegion,
+    plane: Plane,
+    window: Window,
     loops: list[list[tuple[str, Characteristic]]],
     region: DRegion,
     point: tuple[float, float],
     cells: int,
     units: Units,
 ) -> dict[str, Any]:
-    plane, window = found.plane, found.window
     x, y = np.linspace(*window[:2], cells), np.linspace(*window[2:], cells)
     grid_x, grid_y = (grid.ravel() for grid in np.meshgrid(x, y))
     frames, radii, best = [], [], 0.0

@@ -113,9 +113,10 @@ def _plant(entry: dict[str, Any], where: str, fallback: str, delay_s: float) -> 
         plant = plant_of((entry["num"], entry["den"]), delay_s=0.0, name=name)
         return plant_of(Plant(plant.num, plant.den, late, period, name))
     if {"A", "B", "C"} <= set(entry) and not {"num", "den"} & set(entry):
-        a, b, c, d = (_matrix(entry.get(key, 0.0), f"{where}: {key}") for key in ("A", "B", "C", "D"))
+        a, b, c = (_matrix(entry[key], f"{where}: {key}") for key in ("A", "B", "C"))
         states = a.shape[0]
         b = b.reshape(-1, 1) if b.shape[0] == 1 and states != 1 else b
+        d = _matrix(entry["D"], f"{where}: D") if "D" in entry else np.zeros((c.shape[0], b.shape[1]))
         if a.shape[1] != states or b.shape[0] != states or c.shape[1] != states or d.shape != (c.shape[0], b.shape[1]):
             raise UserError(f"{where}: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}: the shapes do not fit")
         return plant_of(control.ss(a, b, c, d, period or 0), delay_s=late, name=name)

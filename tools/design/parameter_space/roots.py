@@ -20,6 +20,9 @@ NEWTON_STEPS = 12
 CONVERGED = 1e-9
 """Newton's last step over the size of the root."""
 
+NOTHING = 1e-11
+"""|p| over the sum of its terms' moduli."""
+
 COUNT_POINTS = 1200
 UNSURE_RAD = 2.0
 """A turn of the phase between two points that is larger than this is looked at again with more points."""
@@ -108,7 +111,12 @@ def _polished(loop: Characteristic, x: Floats, y: Floats, roots: Complexes) -> C
             step = np.where(value == 0.0, 0.0, value / slope)
             s = s - step
         size = np.abs(s) + 1e-3 / loop.delay_s
-        s[~(np.abs(step) < CONVERGED * size)] = np.nan
+        # At a double root the steps shrink slowly, but there is nothing left of p.
+        terms = np.polyval(np.abs(loop.late), np.abs(s)) + np.abs(x) * np.polyval(np.abs(loop.of_x), np.abs(s))
+        terms += np.abs(y) * np.polyval(np.abs(loop.of_y), np.abs(s))
+        terms = np.polyval(np.abs(loop.free), np.abs(s)) + np.abs(shift) * terms
+        found = (np.abs(step) < CONVERGED * size) | ((np.abs(value) < NOTHING * terms) & (np.abs(step) < 1e-3 * size))
+        s[~found] = np.nan
     return _once_each(s)
 
 
