@@ -57,7 +57,7 @@ def loop_response(plant: Plant, law: Law, speed_mps: float, omega_radps: Floats)
 class Margins(NamedTuple):
     """Margins of one loop.
 
-    gain: upwards, a factor, infinite if there is none. phase_deg, delay_s: smallest over all crossovers. disk: 2 over the
+    gain: upwards, a factor, infinite if there is none. phase_deg, delay_s: least of all crossovers. disk: 2 over the
     peak of |(1 - L) / (1 + L)|, which bounds gain and phase changing at once.
     """
 
