@@ -12,12 +12,24 @@ from typing import Any
 import numpy as np
 
 from sim.errors import UserError
+from tools.design.parameter_space import (
+    RULES,
+    AdmissibleRegion,
+    DRegion,
+    Pid,
+    Point,
+    Window,
+    admissible_region,
+    case_of,
+    plane_of,
+    plant_of,
+)
+from tools.design.parameter_space.loop import Complexes
 from tools.design.parameter_space.plant_file import HELP, PlantSet, read_plants
 from tools.run_folder import check_writable_file, write_whole
 
 PLANE_PICTURE, POLES_PICTURE, PAGE, FIGURES = "plane.png", "poles.png", "explorer.html", "parameter_space.json"
 CONTENT = (PLANE_PICTURE, POLES_PICTURE, PAGE, FIGURES)
-RULES = ("centre", "smallest", "smallest on CRB d1")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,16 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Find the admissible set, print the point and its distances, write what was asked for; return the exit status."""
-    from tools.design.parameter_space import (  # noqa: PLC0415 -- numpy, scipy
-        DRegion,
-        Pid,
-        Window,
-        admissible_region,
-        case_of,
-        plane_of,
-        plant_of,
-    )
-
     if args.cells > MOST_CELLS:
         raise UserError(f"--cells {args.cells}: must be {MOST_CELLS} or less")
     if args.choose not in RULES:
@@ -98,7 +100,9 @@ def run(args: argparse.Namespace) -> int:
 MOST_CELLS = 400
 
 
-def figures_of(found: Any, region: Any, point: Any, poles: Any, rule: str) -> dict[str, Any]:
+def figures_of(
+    found: AdmissibleRegion, region: DRegion, point: Point, poles: dict[str, Complexes], rule: str
+) -> dict[str, Any]:
     """The result as plain data: what `--json` holds."""
     return {
         "plane": {"x": found.plane.x, "y": found.plane.y, "fixed": {found.plane.third_name: found.plane.third}},
@@ -187,7 +191,14 @@ def _check_folder(folder: Path) -> None:
 
 
 def _write_folder(
-    folder: Path, given: PlantSet, found: Any, region: Any, point: Any, poles: Any, text: str, pid: Any
+    folder: Path,
+    given: PlantSet,
+    found: AdmissibleRegion,
+    region: DRegion,
+    point: Point,
+    poles: dict[str, Complexes],
+    text: str,
+    pid: Pid,
 ) -> None:
     from tools.design.parameter_space.explorer import Units, explorer_page  # noqa: PLC0415
     from tools.plots import parameter_space as plots  # noqa: PLC0415 -- matplotlib
