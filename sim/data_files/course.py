@@ -185,19 +185,45 @@ def load_course(name_or_path: str | Path) -> Course:
 
 def check_fit(vehicle: Vehicle, course: Course) -> None:
     """Raise UserError where the car cannot stand at start or stop without touching a cone, or the stop lies behind."""
-    outline = outline_of(vehicle)
-    cones = course.cones_xy()
     start, stop = course.start_pose(vehicle), course.stop_pose(vehicle)
     if stop.x_m <= start.x_m:
         raise UserError(
             f"vehicle {vehicle.name} does not fit course {course.name}: the stop would lie "
             f"{start.x_m - stop.x_m:.3f} m behind the start"
         )
-    for what, pose in (("start", start), ("stop", stop)):
-        clearance, index = clearance_m(outline, *pose, cones)
-        if clearance < course.cone_radius_m:
-            raise UserError(
-                f"vehicle {vehicle.name} does not fit course {course.name}: at the {what} its outline is "
-                f"{clearance:.3f} m from the axis of cone {course.cones[index].name}, "
-                f"and must be {course.cone_radius_m:.3f} m or more"
-            )
+    clearance, index, where = _room_standing(vehicle, course)
+    if clearance < course.cone_radius_m:
+        raise UserError(
+            f"vehicle {vehicle.name} does not fit course {course.name}: at the {where} its outline is "
+            f"{clearance:.3f} m from the axis of cone {course.cones[index].name}, "
+            f"and must be {course.cone_radius_m:.3f} m or more{_too_much(vehicle, course)}"
+        )
+
+
+def _room_standing(vehicle: Vehicle, course: Course) -> tuple[float, int, str]:
+    """Return the least clearance at start and stop in m, the cone's index, and where it is."""
+    outline, cones = outline_of(vehicle), course.cones_xy()
+    poses = (("start", course.start_pose(vehicle)), ("stop", course.stop_pose(vehicle)))
+    return min((*clearance_m(outline, *pose, cones), where) for where, pose in poses)
+
+
+def _too_much(vehicle: Vehicle, course: Course) -> str:
+    """Return which dimension keeps the car from standing between the cones, if one does: that of the least change."""
+    best: tuple[float, str] | None = None
+    for name in ("mirror_width_m", "body_width_m", "front_overhang_m", "rear_overhang_m"):
+        value = float(getattr(vehicle, name))
+        for percent in range(99, 0, -1):
+            overlay = {name: 0.01 * percent * value}
+            if name == "body_width_m":
+                overlay["mirror_width_m"] = min(vehicle.mirror_width_m, max(overlay[name], vehicle.body_width_m))
+                if vehicle.mirror_width_m <= vehicle.body_width_m:
+                    overlay["mirror_width_m"] = overlay[name]
+            try:
+                other = vehicle.with_overlay(overlay)
+            except UserError:
+                break
+            if _room_standing(other, course)[0] >= course.cone_radius_m:
+                if best is None or percent > best[0]:
+                    best = (percent, f"; {name} = {value:.3f} prevents it ({overlay[name]:.3f} would do)")
+                break
+    return best[1] if best else ""

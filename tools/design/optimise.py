@@ -165,57 +165,9 @@ def checked(design: PathDesign, vehicle: Vehicle, course: Course) -> PathDesign:
             f"no path of the family passes cone {design.nearest_cone}: {design.clearance_m:.3f} m to its axis, must be"
             f" above cone_radius_m = {course.cone_radius_m:.2f} m"
         )
-    raise UserError(f"vehicle {vehicle.name} on course {course.name}: {what}; {_preventing(vehicle, course, design)}")
+    from tools.design.refusal import preventing  # noqa: PLC0415 -- it needs this module
 
-
-CHANGES = (0.05, 0.12, 0.25, 0.4, 0.55, 0.7)
-"""Relative changes of a dimension that are tried where a car cannot pass."""
-
-CHANGED_ROUNDS = 10
-"""Steps of the local search after each change, from where the one before ended."""
-
-
-def _preventing(vehicle: Vehicle, course: Course, design: PathDesign) -> str:
-    """Return which dimensions prevent the path: those whose least change alone lets the car pass."""
-    smaller = ["body_width_m", "front_overhang_m", "rear_overhang_m", "wheelbase_m"]
-    if vehicle.mirror_width_m > vehicle.body_width_m:
-        smaller.append("mirror_width_m")
-    numbers = {name: np.array(design.numbers) for name in (*smaller, "max_road_wheel_angle_rad")}
-    for change in CHANGES:
-        enough = []
-        for name, before in numbers.items():
-            factor = 1.0 / (1.0 - change) if name == "max_road_wheel_angle_rad" else 1.0 - change
-            other = _with(vehicle, name, factor)
-            if other is None:
-                continue
-            judge = Judge(other, course, other.max_road_wheel_angle_rad, CHOSEN.slope_price_m)
-            free = FreeWaypoints(course.start_pose(other), course.stop_pose(other))
-            numbers[name], _ = improve(judge, free, before, CHANGED_ROUNDS)
-            found = make_path(other, course, tuple(numbers[name]))
-            if (
-                found.clearance_m >= course.cone_radius_m
-                and found.max_road_wheel_angle_rad <= 1.001 * other.max_road_wheel_angle_rad
-            ):
-                value = float(getattr(vehicle, name))
-                enough.append(f"{name} = {value:.3g} prevents it ({factor * value:.2g} would do)")
-        if enough:
-            return ", or ".join(enough)
-    return "wheelbase_m, body_width_m and max_road_wheel_angle_rad together prevent it"
-
-
-def _with(vehicle: Vehicle, name: str, factor: float) -> Vehicle | None:
-    """Return the car with one dimension changed, those that belong to it too; None where no such car can be."""
-    overlay = {name: factor * float(getattr(vehicle, name))}
-    if name == "mirror_width_m":
-        overlay[name] = max(overlay[name], vehicle.body_width_m)
-    elif name == "body_width_m" and vehicle.mirror_width_m <= vehicle.body_width_m:
-        overlay["mirror_width_m"] = overlay[name]
-    elif name == "wheelbase_m":
-        overlay["cg_to_rear_axle_m"] = factor * vehicle.cg_to_rear_axle_m
-    try:
-        return vehicle.with_overlay(overlay)
-    except UserError:
-        return None
+    raise UserError(f"vehicle {vehicle.name} on course {course.name}: {what}; {preventing(vehicle, course, design)}")
 
 
 def max_road_wheel_slope(design: PathDesign, wheelbase_m: float) -> float:

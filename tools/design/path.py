@@ -81,7 +81,8 @@ def coarse(fit: FitResult, step_m: float) -> Geometry:
     points of a long one. At the joints the curvature's slope has its peaks.
     """
     border = np.concatenate([[0.0], np.cumsum(fit.length_m)])
-    even = np.linspace(0.0, border[-1], max(2, math.ceil(border[-1] / step_m) + 1))
+    # The number of steps must not hang on the last digit of the length: an optimiser compares paths point by point.
+    even = np.linspace(0.0, border[-1], max(2, math.ceil(border[-1] / step_m - 1e-6) + 1))
     parameter = np.concatenate([even, border[1:-1]])
     segment = np.clip(np.searchsorted(border, parameter, side="right") - 1, 0, len(fit.length_m) - 1)
     return geometry(fit, segment, (parameter - border[segment]) / fit.length_m[segment])

@@ -25,7 +25,7 @@ FORMAT = 1
 ROOT = Path(__file__).resolve().parent.parent.parent
 DBC_FOLDER = ROOT / "dbc"
 SHIPPED_FOLDER = ROOT / "firmware_py" / "tables"
-SHIPPED = (("paper", "ohio"), ("fusion", "ohio"), ("paper", "paper"))
+SHIPPED = (("paper", "ohio"), ("fusion", "ohio"), ("compact", "ohio"), ("pickup", "ohio"), ("paper", "paper"))
 """Vehicles and courses whose tables come with the project."""
 
 SOURCES = (
