@@ -512,14 +512,12 @@ def test_mistakes_in_a_scenario_file(old: str, new: str, message: str, tmp_path:
         (
             {"body_width_m": 2.6, "mirror_width_m": 2.6},
             "vehicle paper does not fit course ohio: at the start its outline is 0.072 m from the axis of cone "
-            "front-left, "
-            "and must be 0.100 m or more",
+            "front-left, and must be 0.100 m or more; body_width_m = 2.600 prevents it (2.522 would do)",
         ),
         (
             {"mirror_width_m": 2.8, "mirror_from_rear_axle_m": 4.85},
             "vehicle paper does not fit course ohio: at the start its outline is -0.028 m from the axis of "
-            "cone front-left, "
-            "and must be 0.100 m or more",
+            "cone front-left, and must be 0.100 m or more; mirror_width_m = 2.800 prevents it (2.520 would do)",
         ),
     ],
 )

@@ -214,10 +214,8 @@ def _too_much(vehicle: Vehicle, course: Course) -> str:
         value = float(getattr(vehicle, name))
         for percent in range(99, 0, -1):
             overlay = {name: 0.01 * percent * value}
-            if name == "body_width_m":
-                overlay["mirror_width_m"] = min(vehicle.mirror_width_m, max(overlay[name], vehicle.body_width_m))
-                if vehicle.mirror_width_m <= vehicle.body_width_m:
-                    overlay["mirror_width_m"] = overlay[name]
+            if name == "body_width_m" and vehicle.mirror_width_m <= vehicle.body_width_m:
+                overlay["mirror_width_m"] = overlay[name]
             try:
                 other = vehicle.with_overlay(overlay)
             except UserError:

@@ -6,38 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from tools.design import gains as criteria
-from tools.design import model
-from tools.design.certificate import Certificate, margins_of
-from tools.design.model import Row
+from tools.design.certificate import Certificate
 from tools.design.optimise import CHOSEN, max_road_wheel_slope
 from tools.design.speed_profile import road_wheel_slope
 from tools.design.tables import MAX_SPEED_MPS, DesignReport, speed_limits
 
-LAW = "car"
-RESOLUTION = 300
-"""Frequencies a loop is computed at for the curves; the certificate takes more."""
 
-
-def margins_over_speed(report: DesignReport) -> list[dict[str, Any]]:
-    """Return disk and delay margin over the speeds of the gain table, each of the worst car, an entry a direction."""
-    nominal = model.nominal_of(report.vehicle)
-    cars = criteria.corners(report.vehicle)
-    top_mps = criteria.checked_speeds(report.vehicle)[-1]
+def margins_over_speed(certificate: Certificate) -> list[dict[str, Any]]:
+    """Return disk and delay margin over speed, each of the worst car of the box, an entry a direction."""
     found = []
-    for direction, name in ((1.0, "forward"), (-1.0, "reverse")):
-        entry: dict[str, Any] = {"direction": name, "speed_mps": [], "disk": [], "delay_samples": []}
-        for row in (Row(*values) for values in report.gains[LAW]):
-            if row.direction != direction or not 0.0 < row.speed_mps <= top_mps:
-                continue
-            omega = criteria.frequencies(row.speed_mps, RESOLUTION)
-            predicts = LAW in criteria.PREDICTING_LAWS
-            loops = model.loop_response(row, nominal, cars, criteria.on_circle(omega), predicts)
-            margins = [margins_of(loop, omega) for loop in loops]
-            entry["speed_mps"].append(row.speed_mps)
-            entry["disk"].append(min(margin.disk for margin in margins))
-            entry["delay_samples"].append(min(margin.delay_samples for margin in margins))
-        found.append(entry)
+    for sign, name in ((1.0, "forward"), (-1.0, "reverse")):
+        rows = sorted(row[1:] for row in certificate.by_speed if row[0] == sign)
+        speed_mps, disk, delay_samples = (list(column) for column in zip(*rows, strict=True))
+        found.append({"direction": name, "speed_mps": speed_mps, "disk": disk, "delay_samples": delay_samples})
     return found
 
 
@@ -73,7 +54,7 @@ def draw(report: DesignReport, certificate: Certificate, file: Path) -> None:
         path=path,
         profiles=report.profiles,
         steering={"angle_rad": np.arctan(vehicle.wheelbase_m * path.curvature_1pm), "slope_radpm": slope},
-        margins=margins_over_speed(report),
+        margins=margins_over_speed(certificate),
         limits={
             "angle_rad": vehicle.max_road_wheel_angle_rad,
             "planned_angle_rad": CHOSEN.angle_share * vehicle.max_road_wheel_angle_rad,
