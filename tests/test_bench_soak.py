@@ -75,7 +75,7 @@ def test_the_verdict_counts_both_sides_and_what_cyclictest_saw(tmp_path: Path) -
         "tests_completed": {"tests": two[:1]},
         "frames_lost": {"tests": two, "vehicle": {"lost": 1}},
         "frames_rejected": {"tests": two, "frames_rejected": 1},
-        "frames_refused_by_the_driver": {"tests": two, "send_failed": 1},
+        "frames_refused": {"tests": two, "send_failed": 1},
         "memory_growth_mib": {"tests": [two[0], two[1]._replace(rss_mib=35.6)]},
         "late_cycles": {"tests": two, "late_cycles": 12},
     }

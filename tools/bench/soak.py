@@ -247,7 +247,7 @@ def figures_of(
         Row("faults", soak.faults, 0),
         Row("frames_lost", lost, 0),
         Row("frames_rejected", rejected, 0),
-        Row("frames_refused_by_the_driver", controller.get("send_failed") or 0, 0),
+        Row("frames_refused", controller.get("send_failed") or 0, 0),
         Row("cones_touched", len(exam.get("cones_touched", ())), 0),
         Row("memory_growth_mib", max(memory) - memory[0] if memory else 0.0, MEMORY_MIB),
     ]
