@@ -222,7 +222,8 @@ def _write_folder(
         corners=[{"number": float(number)} for number in range(1, most)],
         pid=pid,
         units=units,
-        intro=f"Negative feedback, u = -(kp + ki/s + kd s) y. Shaded: gains for which {_meaning(len(found.cases))}.",
+        intro=f"Negative feedback, u = -(kp + ki/s + kd s) y{_sampling(given)}. Shaded: gains for which "
+        f"{_meaning(len(found.cases))}.",
     )
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -243,6 +244,10 @@ def _at(given: PlantSet, speed: float) -> list[Any]:
     if not given.speeds_mps:
         return list(given.plants)
     return [plant for plant, own in zip(given.plants, given.speeds_mps, strict=True) if own == speed]
+
+
+def _sampling(given: PlantSet) -> str:
+    return " with s = (z - 1)/(T z)" if given.plants[0].period_s else ""
 
 
 def _meaning(cases: int) -> str:
