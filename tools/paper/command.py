@@ -65,8 +65,11 @@ def run(args: argparse.Namespace) -> int:
     content = tables.as_json(results)
     if args.out is not None:
         from tools.paper import page  # noqa: PLC0415 -- matplotlib
+        from tools.paper.loops import study as study_loops  # noqa: PLC0415
+        from tools.paper.plant import FORWARD  # noqa: PLC0415
 
-        page.write(args.out, results, content, lambda line: _say(console, line))
+        loops = study_loops(results.car, results.gains, results.tracks[FORWARD], lambda line: _say(console, line))
+        page.write(args.out, results, loops, content, lambda line: _say(console, line))
     _print(console, results, content)
     text = json.dumps(content, indent=2) + "\n"
     if args.json is not None:

@@ -35,7 +35,8 @@ caption{text-align:left;font-weight:600;padding:.3rem 0}
 .scroll{overflow-x:auto}
 td.bad{color:var(--wrong);font-weight:600}
 td.good{color:var(--ours)}
-.eq{font-family:"STIX Two Math","Cambria Math",Georgia,serif;background:#f6f8fa;padding:.5rem 1rem;margin:.7rem 0;overflow-x:auto}
+.eq{font-family:"STIX Two Math","Cambria Math",Georgia,serif;background:#f6f8fa;padding:.5rem 1rem;
+margin:.7rem 0;overflow-x:auto}
 .big{display:flex;flex-wrap:wrap;gap:1rem;margin:1.4rem 0}
 .big div{flex:1 1 200px;border:1px solid var(--line);border-radius:.5rem;padding:.8rem 1rem}
 .big strong{display:block;font-size:1.5rem;line-height:1.25}
@@ -92,7 +93,7 @@ def figure(file: Path, caption: str) -> str:
 
 def number(value: float | None, digits: int = 3) -> str:
     """A figure for people; a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}g}"
+    return "-" if value is None else f"{value:.{digits}g}"
 
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, str, str]]) -> str:

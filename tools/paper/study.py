@@ -117,7 +117,8 @@ def compute(vehicle: Vehicle, course: Course, stored: StoredFit, tell: Callable[
     return Study(
         vehicle, course, car, outline, stored, gains, TABLE_3, paths,
         path_study.sweep(stored.waypoints, VARIANTS[0]), path_study.sweep(stored.waypoints, VARIANTS[-1]),
-        tracks, motions, results, leaving, room_m, rear_path, rear_runs, study_rates(car, gains, paths), convergence(car, gains, tracks[FORWARD]),
+        tracks, motions, results, leaving, room_m, rear_path, rear_runs, study_rates(car, gains, paths),
+        convergence(car, gains, tracks[FORWARD]),
     )  # fmt: skip
 
 

@@ -53,7 +53,8 @@ def small_tables(study: Study) -> dict[str, dict[str, dict[str, Any]]]:
     schedule = study.schedule
     table4 = {
         "Cf_n_per_rad": (3e5, car.front_stiffness), "lf_m": (2.0, car.front_m),
-        "Cr_n_per_rad": (3e5, car.rear_stiffness), "lr_m": (2.0, car.rear_m), "M_kg": (3000.0, car.mass_kg), "Iz_kgm2": (5113.0, car.inertia_kgm2),
+        "Cr_n_per_rad": (3e5, car.rear_stiffness), "lr_m": (2.0, car.rear_m),
+        "M_kg": (3000.0, car.mass_kg), "Iz_kgm2": (5113.0, car.inertia_kgm2),
         "omega_n_radps": (100.0, TABLE_4_OBSERVER.bandwidth_radps), "xi": (0.707, TABLE_4_OBSERVER.damping),
     }  # fmt: skip
     table3 = {

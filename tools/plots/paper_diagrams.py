@@ -26,10 +26,16 @@ def _box(axes: Axes, at: Point, text: str, *, width: float = 1.3, height: float 
     x, y = at
     axes.add_patch(
         FancyBboxPatch(
-            (x - 0.5 * width, y - 0.5 * height), width, height, boxstyle="round,pad=0,rounding_size=0.08",
-            fc=colour + "1c", ec=colour, lw=1.8, zorder=3,
+            (x - 0.5 * width, y - 0.5 * height),
+            width,
+            height,
+            boxstyle="round,pad=0,rounding_size=0.08",
+            fc=colour + "1c",
+            ec=colour,
+            lw=1.8,
+            zorder=3,
         )
-    )  # fmt: skip
+    )
     axes.text(x, y, text, ha="center", va="center", fontsize=13, color=INK, zorder=4)
 
 
@@ -45,9 +51,12 @@ def _wire(axes: Axes, *points: Point, arrow: bool = True, text: str = "", colour
     axes.plot(x[:-1] if arrow else x, y[:-1] if arrow else y, color=colour, lw=1.6, zorder=2, solid_capstyle="round")
     if arrow:
         axes.annotate(
-            "", points[-1], points[-2], zorder=2,
+            "",
+            points[-1],
+            points[-2],
+            zorder=2,
             arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.6, "shrinkA": 0, "shrinkB": 0},
-        )  # fmt: skip
+        )
     if text:
         middle = 0.5 * (np.array(points[0]) + np.array(points[1]))
         axes.text(middle[0], middle[1] + 0.16, text, ha="center", va="bottom", fontsize=12.5, color=colour)
@@ -114,10 +123,11 @@ def figure_6(stem: Path) -> None:
     axes.annotate(
         "rear axle: the point\nthat should be tracked",
         rear,
-        (-92, 34),
+        (-150, 70),
         textcoords="offset points",
         color=GREEN,
         fontsize=11,
+        arrowprops={"arrowstyle": "-", "color": GREEN},
     )
     axes.set_aspect("equal")
     axes.set(xlim=(-1.2, 11.2), ylim=(-1.0, 4.6))

@@ -24,7 +24,7 @@ from tools.plots.paper_style import (
     save,
     sheet,
     thin,
-)  # fmt: skip
+)
 from tools.plots.parameter_space import draw_plane, draw_poles
 
 MANY_SPEEDS = np.geomspace(0.1, 1.0, 60)

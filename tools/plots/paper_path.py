@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sim.data_files import Side
 from tools.design.waypoints import interpolate
 from tools.paper.path_study import AS_PRINTED, CORRECTED, FOOT_M, segment_points
 from tools.paper.plant import FORWARD, REVERSE
@@ -25,7 +26,7 @@ from tools.plots.paper_style import (
     sheet,
     swept,
     thin,
-)  # fmt: skip
+)
 
 
 def rear_axle_poses(study: Study, every: int = 20) -> tuple[Any, Any, Any]:
@@ -40,15 +41,13 @@ def rear_axle_poses(study: Study, every: int = 20) -> tuple[Any, Any, Any]:
 
 def figure_1(study: Study, stem: Path) -> None:
     """Course with both options."""
+    sides: tuple[tuple[Side, float, str], ...] = (
+        ("left", 1.0, "(a) lane change to the left"),
+        ("right", -1.0, "(b) lane change to the right"),
+    )
     figure, axes = sheet(1, 2, width=13.0, height=4.2, sharey=True)
     x, y, yaw = rear_axle_poses(study)
-    for one, side, sign, title in zip(
-        axes,
-        ("left", "right"),
-        (1.0, -1.0),
-        ("(a) lane change to the left", "(b) lane change to the right"),
-        strict=True,
-    ):
+    for one, (side, sign, title) in zip(axes, sides, strict=True):
         course(one, study.course, side)
         swept(one, study.outline, x, sign * y, sign * yaw, BLUE, 0.75)
         path = study.paths[AS_PRINTED].path

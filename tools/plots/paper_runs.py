@@ -26,7 +26,7 @@ from tools.plots.paper_style import (
     sheet,
     swept,
     thin,
-)  # fmt: skip
+)
 
 
 def axle_poses(study: Study, result: Result, direction: str, every: int = 100) -> tuple[Any, Any, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon
 
@@ -28,7 +29,7 @@ mpl.rcParams.update(
         "axes.titlelocation": "left",
         "axes.edgecolor": GREY,
         "axes.labelcolor": INK,
-        "axes.prop_cycle": mpl.cycler(color=SERIES),
+        "axes.prop_cycle": cycler(color=SERIES),
         "axes.spines.top": False,
         "axes.spines.right": False,
         "grid.color": PALE,
@@ -48,7 +49,7 @@ def sheet(rows: int = 1, columns: int = 1, *, width: float = 10.0, height: float
     return plt.subplots(rows, columns, figsize=(width, height), layout="constrained", **options)
 
 
-def finish(axes: Axes, x: str, y: str, title: str = "", *, legend: bool | str = False) -> None:
+def finish(axes: Axes, x: str, y: str, title: str = "", *, legend: Any = False) -> None:
     """Label an axes, give it a grid, and a legend where asked for (True, or where)."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -57,7 +58,8 @@ def finish(axes: Axes, x: str, y: str, title: str = "", *, legend: bool | str = 
     axes.grid(visible=True)
     axes.set_axisbelow(True)
     if legend:
-        axes.legend(loc=legend if isinstance(legend, str) else "best")
+        where: Any = legend if isinstance(legend, str) else "best"
+        axes.legend(loc=where)
 
 
 def save(figure: Any, stem: Path) -> None:
@@ -100,7 +102,7 @@ def course(axes: Axes, which: Course, side: Side = "left", *, names: bool = True
 
 def body(axes: Axes, outline: Outline, x_m: float, y_m: float, yaw_rad: float, **style: Any) -> None:
     """The body's outline with its rear-axle centre at a pose."""
-    options = {"fill": False, "ec": INK, "lw": 1.2, "zorder": 4} | style
+    options: dict[str, Any] = {"fill": False, "ec": INK, "lw": 1.2, "zorder": 4} | style
     axes.add_patch(Polygon(polygon(outline, x_m, y_m, yaw_rad), **options))
 
 
