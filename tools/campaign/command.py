@@ -104,9 +104,10 @@ def run(args: argparse.Namespace) -> int:
                  for name, default in DEFAULTS.items()}  # fmt: skip
         if given["seed"] < 0:
             raise UserError(f"--seed {given['seed']}: must not be negative")
+        if args.out is not None:
+            _check_out(args.out)
         campaign = _prepare(given, args.runs, stack)
         file = args.out or _default_file(campaign.scenario.name)
-        _check_out(file)
         return _drive(campaign, file, None, args, workers)
 
 
@@ -134,10 +135,11 @@ def _workers(args: argparse.Namespace) -> int:
 
 def _default_file(scenario: str) -> Path:
     folder = Path("runs")
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be made a folder: {error.strerror}; name a file with --out") from None
+    if not folder.is_dir():
+        try:
+            folder.mkdir()
+        except OSError as error:
+            raise UserError(f"{folder}: cannot be made a folder: {error.strerror}; name a file with --out") from None
     return folder / f"campaign-{scenario}-{time.strftime('%Y%m%d-%H%M%S')}.parquet"
 
 
@@ -151,8 +153,13 @@ def _check_out(file: Path) -> None:
         raise UserError(f"--out {file}: a campaign was begun there; go on with --resume {file}, or name another file")
 
 
-def _prepare(given: dict[str, Any], runs: int, stack: ExitStack, kept: dict[str, str] | None = None) -> Campaign:
-    """Load and check all files, design tables where none are shipped; `kept` are those of a campaign begun before."""
+def _prepare(
+    given: dict[str, Any], runs: int, stack: ExitStack, begun: dict[str, Any] | None = None, file: Path = Path()
+) -> Campaign:
+    """Load and check all files, design tables where none are shipped.
+
+    `begun` is what the journal or `file` of a campaign tells of it: then it must be the same, and brings its tables.
+    """
     from sim.data_files import check_fit, load_course, load_scenario, load_vehicle  # noqa: PLC0415
     from tools.campaign import work  # noqa: PLC0415
     from tools.campaign.draws import TABLE  # noqa: PLC0415
@@ -165,14 +172,24 @@ def _prepare(given: dict[str, Any], runs: int, stack: ExitStack, kept: dict[str,
     vehicle = load_vehicle(given["vehicle"], scenario.vehicle_overlay)
     course = load_course(given["course"])
     check_fit(vehicle, course)
-    if kept is not None:
-        tables = _unpack_tables(kept, stack)
+    digest = {
+        "vehicle": _digest(vehicle.file_bytes),
+        "course": _digest(course.model_dump_json().encode()),
+        "scenario": _digest(scenario.model_dump_json().encode()),
+        "dbc": _digest(DBC.read_bytes()),
+        "code": work.code_digest(),
+    }
+    if begun is not None:
+        _same_digests(digest, begun, file)
+        tables = _unpack_tables(begun["tables_zlib"], stack)
     elif given["tables"]:
         tables = Path(given["tables"])
     else:
         tables = _tables(vehicle, course, stack)
     shared = share(vehicle, course, given["law"], tables)
-    job = work.Job(shared, scenario, given["seed"], runs, work.chunk_runs_of(runs), work.code_digest())
+    job = work.Job(shared, scenario, given["seed"], runs, work.chunk_runs_of(runs), digest["code"])
+    if begun is not None:
+        return Campaign(vehicle, course, scenario, given["law"], tables, job, begun)
     tables_text = {file.name: file.read_bytes() for file in sorted(tables.iterdir()) if file.is_file()}
     about = {
         **given,
@@ -181,14 +198,7 @@ def _prepare(given: dict[str, Any], runs: int, stack: ExitStack, kept: dict[str,
         "scenario": str(given["scenario"]),
         "runs": runs,
         "chunk_runs": job.chunk_runs,
-        "digest": {
-            "vehicle": _digest(vehicle.file_bytes),
-            "course": _digest(course.model_dump_json().encode()),
-            "scenario": _digest(scenario.model_dump_json().encode()),
-            "tables": _digest(b"".join(tables_text.values())),
-            "dbc": _digest(DBC.read_bytes()),
-            "code": job.code,
-        },
+        "digest": {**digest, "tables": _digest(b"".join(tables_text.values()))},
         "draws": [list(line) for line in TABLE],
         "tables_zlib": {name: base64.b64encode(zlib.compress(text)).decode() for name, text in tables_text.items()},
     }
@@ -258,14 +268,14 @@ def _same_options(args: argparse.Namespace, about: dict[str, Any], file: Path) -
 
 def _again(about: dict[str, Any], file: Path, stack: ExitStack) -> Campaign:
     """Load the campaign that a journal or file tells of. Raises UserError where it is no longer the same."""
-    given = {name: about[name] for name in DEFAULTS}
-    campaign = _prepare(given, about["runs"], stack, about["tables_zlib"])
-    job = campaign.job._replace(chunk_runs=about["chunk_runs"])
-    for what, digest in campaign.about["digest"].items():
-        if digest != about["digest"][what]:
+    return _prepare({name: about[name] for name in DEFAULTS}, about["runs"], stack, about, file)
+
+
+def _same_digests(digest: dict[str, str], begun: dict[str, Any], file: Path) -> None:
+    for what, is_now in digest.items():
+        if is_now != begun["digest"][what]:
             named = "parkctl itself" if what == "code" else f"the {what}"
             raise UserError(f"--resume {file}: {named} is no longer what the campaign was begun with; begin anew")
-    return campaign._replace(job=job, about=about)
 
 
 # -- driving ----------------------------------------------------------------------------------------------------------

@@ -196,7 +196,7 @@ def drive_on_cluster(job: Job, chunks: list[int], address: str) -> Iterator[tupl
             return client.submit(_drive_there, there, digest, chunk, key=f"parkctl-{digest[:16]}-{chunk}")
 
         width = max(8, WAITING_A_WORKER * sum(client.nthreads().values()))
-        running = dask.as_completed([submit(chunk) for chunk in islice(waiting, width)])
+        running = dask.as_completed([submit(chunk) for chunk in islice(waiting, width)], loop=client.loop)
         for future in running:
             code, chunk, rows = _result(future, address)
             if code != job.code:
