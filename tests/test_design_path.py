@@ -12,7 +12,7 @@ from tools.design.optimise import CHOSEN, optimise_path
 from tools.design.path import mirrored, sample
 from tools.design.path_fit import fit_path, joint_jumps, pins
 from tools.design.speed_profile import plan_speed, profile_jerk, road_wheel_slope
-from tools.design.tables import run_design, speed_limits
+from tools.design.tables import speed_limits
 from tools.design.waypoints import Waypoints, interpolate
 
 FT_M = 0.3048
@@ -172,18 +172,3 @@ def test_more_conditions_than_coefficients_is_one_line():
     dense = interpolate(PAPER_LIKE)
     with pytest.raises(UserError, match="conditions"):
         fit_path(dense, p=3, q=3, start=pins(0.0, 0.0, 0.0), stop=pins(15.24, 1.3716, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("overlay", "says"),
-    [
-        ({"body_width_m": 2.7, "mirror_width_m": 2.7}, "does not fit|prevents it"),
-        ({"max_road_wheel_angle_rad": 0.12}, "max_road_wheel_angle_rad|prevents it"),
-        ({"max_road_wheel_rate_radps": 0.02}, "max_road_wheel_rate_radps"),
-    ],
-)
-def test_a_car_that_cannot_pass_is_told_what_prevents_it(overlay, says):
-    vehicle, course = load_vehicle("paper").with_overlay(overlay), load_course("ohio")
-    with pytest.raises(UserError, match=says) as caught:
-        run_design(vehicle, course)
-    assert "\n" not in str(caught.value)
