@@ -21,7 +21,7 @@ from tools.run_folder import check_writable_file, write_whole
 if TYPE_CHECKING:
     from rich.console import Console
 
-GROUPS = ("wake", "tick", "codec", "turnaround", "process", "lockstep")
+GROUPS = ("wake", "tick", "codec", "turnaround", "process", "lockstep", "campaign")
 CONTENT = ("wake.png", "wake_loaded.png", "tick_cold.png", "turnaround.png", "bench.json")
 PERIOD_US = 10_000.0
 
@@ -35,10 +35,11 @@ class _Size(NamedTuple):
     hot_samples: int
     turns: int
     lockstep_s: float
+    campaign_runs: int
 
 
-FULL = _Size(rounds=5, wake_s=3.0, cold_samples=150, hot_samples=1500, turns=150, lockstep_s=60.0)
-QUICK = _Size(rounds=2, wake_s=1.5, cold_samples=100, hot_samples=800, turns=80, lockstep_s=20.0)
+FULL = _Size(rounds=5, wake_s=3.0, cold_samples=150, hot_samples=1500, turns=150, lockstep_s=60.0, campaign_runs=200)
+QUICK = _Size(rounds=2, wake_s=1.5, cold_samples=100, hot_samples=800, turns=80, lockstep_s=20.0, campaign_runs=50)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -132,6 +133,8 @@ class Bench:
                 steps.append(("start of the controller", self._process))
             if "lockstep" in self._groups:
                 steps.append(("lock-step", self._lockstep))
+            if "campaign" in self._groups:
+                steps.append(("campaign (compiles the first time: half a minute)", self._campaign))
             for number in range(self._size.rounds):
                 for name, step in steps:
                     self._say(f"round {number + 1} of {self._size.rounds}: {name}")
@@ -226,6 +229,13 @@ class Bench:
 
         self._rounds["lockstep_ratio"].append(lockstep_times_real_time(self._size.lockstep_s))
 
+    def _campaign(self) -> None:
+        from tools.bench.process import campaign_runs_per_s  # noqa: PLC0415
+
+        compiled, plain = campaign_runs_per_s(self._size.campaign_runs)
+        self._rounds["campaign_rate"].append(compiled)
+        self._rounds["campaign plain"].append(plain)
+
     # -- results ------------------------------------------------------------------------------------------------------
 
     def rows(self) -> list[Row]:
@@ -236,6 +246,7 @@ class Bench:
             "tick_hot_in_calls": ("tick_hot plain_p50", "tick_hot empty_p50"),
             "codec_frame": ("codec own_p50", "codec socket_p50"),
             "codec_frame_by_cantools": ("codec own_p50", "codec cantools_p50"),
+            "campaign_rate": ("campaign_rate", "campaign plain"),
             "wake_p99_normal_loaded": ("wake normal_loaded_p99", "wake cyclictest_loaded_p99"),
         }
         for share in ("p50", "p99"):
@@ -247,7 +258,6 @@ class Bench:
         if "tick_cold plain_p99" in values:
             shares = [100.0 * us / PERIOD_US for us in values["tick_cold plain_p99"]]
             values["tick_cold_p99_of_period"] = shares
-        self._why.setdefault("campaign_rate", "there is no compiled campaign in this version")
         rows = []
         for name in LIMITS:
             value, floor = figures.get(name, (name, ""))

@@ -91,3 +91,46 @@ def lockstep_times_real_time(longest_s: float) -> float:
     if done.returncode != 0:
         raise UserError(f"the lock-step run failed: {done.stderr.strip().splitlines()[-1]}")
     return float(done.stdout)
+
+
+_CAMPAIGN = """
+import sys, time
+from sim.data_files import load_course, load_scenario, load_vehicle
+from tools.bench.recording import TABLES
+from tools.campaign.draws import draw
+from tools.campaign.single import Runner, share
+
+vehicle, scenario = load_vehicle("paper"), load_scenario("car")
+shared = share(vehicle, load_course("ohio"), "car", TABLES)
+drawn = [draw(vehicle, scenario, seed) for seed in range(int(sys.argv[1]))]
+
+
+def runs_per_s(runner, drawn):
+    begun = time.process_time()
+    for one in drawn:
+        runner.run(one.scenario, one.side, one.seed)
+    return len(drawn) / (time.process_time() - begun)
+
+
+compiled = Runner(shared)
+runs_per_s(compiled, drawn[:1])
+print(runs_per_s(compiled, drawn), runs_per_s(Runner(shared, compiled=False), drawn[:1]))
+"""
+
+
+def campaign_runs_per_s(runs: int) -> tuple[float, float]:
+    """Return runs a second of one core, by CPU time of a process of its own: compiled, and the same source plain.
+
+    The first time the process compiles, which takes half a minute; it finds that done afterwards.
+    """
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", _CAMPAIGN, str(runs)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment_without_can_settings(),
+    )
+    if done.returncode != 0:
+        raise UserError(f"the campaign's runs failed: {done.stderr.strip().splitlines()[-1]}")
+    compiled, plain = map(float, done.stdout.split())
+    return compiled, plain
