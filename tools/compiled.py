@@ -9,6 +9,7 @@ import importlib
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -112,8 +113,11 @@ def _array_leg(leg: LegTable) -> LegTable:
     return leg._replace(**arrays)
 
 
-KEPT_CACHES = 6
-"""Folders of compiled code that are kept, one a state of the sources; a megabyte or two each."""
+KEPT_CACHES = 32
+"""Folders of compiled code that are kept, one a state of the sources; about a megabyte each."""
+
+KEPT_S = 7 * 86_400.0
+"""Whatever was used within this time is kept however many there are: somebody may be using it now."""
 
 
 def cache_folder(names: tuple[str, ...], *more: str) -> Path | None:
@@ -139,7 +143,8 @@ def cache_folder(names: tuple[str, ...], *more: str) -> Path | None:
         os.utime(folder)
         newest_first = sorted(root.iterdir(), key=lambda other: other.stat().st_mtime, reverse=True)
         for old in newest_first[KEPT_CACHES:]:
-            shutil.rmtree(old, ignore_errors=True)
+            if old.stat().st_mtime < time.time() - KEPT_S:
+                shutil.rmtree(old, ignore_errors=True)
     except OSError:
         return None
     return folder

@@ -340,8 +340,8 @@ def _source(job: Job, chunks: list[int], scheduler: str | None, workers: int) ->
         return
     if not is_compiled():
         print("compiling core and plant, once for this version (half a minute)", file=sys.stderr, flush=True)
-        # Here, so that the workers find it done; a run of its own is what makes numba compile.
-        work.drive_chunk(job._replace(runs=1), Runner(job.shared), 0)
+    # Here first, so that the workers find it done; a run of its own is what makes numba compile.
+    work.drive_chunk(job._replace(runs=1), Runner(job.shared), 0)
     yield from work.drive_on_this_machine(job, chunks, workers)
 
 
