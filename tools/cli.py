@@ -31,6 +31,10 @@ COMMANDS = {
         "tools.campaign.command",
         "Monte Carlo: thousands of tests with car, sensors and start not known before",
     ),
+    "compare": (
+        "tools.compare.command",
+        "ten other controllers beside the shipped one, tuned alike, on the same plant, path and seeds",
+    ),
     "bench": ("tools.bench.command", "what the controller costs: jitter, tick, codec, turnaround, beside their floors"),
     "soak": ("tools.bench.soak", "many tests in a row with the same processes: frames, faults, memory, late cycles"),
     "guest": ("tools.guest.command", "run a command where a real vcan0 is, on any Linux on x86-64, without root"),
@@ -53,6 +57,7 @@ ORDER = (
     "design",
     "parameter-space",
     "paper",
+    "compare",
     "campaign",
     "deploy",
     "bench",

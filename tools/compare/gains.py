@@ -16,7 +16,7 @@ ROWS = 20
 
 def speeds_mps() -> Floats:
     """Return the speeds of the rows."""
-    return FIRST_SPEED_MPS * np.arange(1, ROWS + 1)
+    return np.array([FIRST_SPEED_MPS * row for row in range(1, ROWS + 1)])
 
 
 def blind_model(speed_mps: float, period_s: float = PERIOD_S) -> tuple[Floats, Floats]:

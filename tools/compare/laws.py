@@ -27,8 +27,8 @@ CAR, FF, PURE_PURSUIT, STANLEY, REAR_WHEEL, LQR, LQR_PREVIEW, MPC, PID, PID_FF, 
 Solve = Callable[[float, float, float, float, float, float, float], float]
 
 MPC_ARGUMENTS = 7
-"""Of `Solve`: sigma, station (m), speed (m/s), cross-track error (m), theta (rad), wheels' angle and last command (rad);
-it returns the command (rad)."""
+"""Of `Solve`: sigma, station (m), speed (m/s), cross-track error (m), theta (rad), wheels' angle (rad) and last command
+(rad); it returns the command (rad)."""
 
 PREVIEW_CYCLES = 60
 """Cycles of path ahead that the LQR with preview sees."""
@@ -76,7 +76,7 @@ class Seen(NamedTuple):
 
 
 def on_path(leg: LegTable, near_m: float, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float, float]:
-    """Return station (m), cross-track error (m) and heading error (rad; tyre slip off) of a pose, from a station near."""
+    """Return station (m), cross-track error (m) and heading error (rad) of a pose, from a station near it."""
     station_m = near_m
     cross_m = 0.0
     heading_rad = 0.0
@@ -102,9 +102,10 @@ def steer(
     memory: MutableSequence[float],
     solve: Solve,
 ) -> float:
-    """Return the wanted road-wheel angle (rad). `p`: the law's tuned numbers; `table`: its gains by speed, if it has any.
+    """Return the wanted road-wheel angle (rad).
 
-    `memory` is LAW_SLOTS numbers, all 0 at the beginning of a leg; `solve` is called by the MPC.
+    `p`: the law's tuned numbers; `table`: its gains by speed, if it has any; `memory`: LAW_SLOTS numbers, all 0 at
+    the beginning of a leg; `solve` is called by the MPC.
     """
     if law == FF:
         return _feedforward_rad(leg, car, seen, p[0])

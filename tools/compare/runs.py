@@ -43,7 +43,7 @@ MODULES = (
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """A controller: its law, and the numbers that are tuned: name and box, searched on a logarithmic scale.
+    """A controller: its law, and the numbers that are tuned: name and box, and a guess by hand to start from.
 
     `inputs` are those that it is driven with.
     """
@@ -51,51 +51,64 @@ class Controller:
     law: int
     about: str
     box: dict[str, tuple[float, float]]
+    guess: tuple[float, ...]
     inputs: tuple[str, ...] = INPUTS
 
 
 CONTROLLERS = {
-    "ff": Controller(laws.FF, "feedforward only", {"ahead_s": (0.005, 0.5)}),
+    "ff": Controller(laws.FF, "feedforward only", {"ahead_s": (0.005, 0.5)}, (0.1,)),
     "pure-pursuit": Controller(
-        laws.PURE_PURSUIT, "pure pursuit (Coulter 1992)", {"least_m": (0.05, 4.0), "ahead_s": (0.05, 4.0)}
+        laws.PURE_PURSUIT, "pure pursuit (Coulter 1992)", {"least_m": (0.05, 4.0), "ahead_s": (0.05, 4.0)}, (0.3, 0.7)
     ),
     "stanley": Controller(
         laws.STANLEY,
         "Stanley (Hoffmann 2007), in reverse at the rear axle",
         {"k_1ps": (0.02, 5.0), "k_reverse_1ps": (0.005, 2.0), "soft_mps": (0.01, 1.0), "k_yaw_s": (0.005, 2.0)},
+        (0.5, 0.1, 0.1, 0.1),
     ),
     "rear-wheel": Controller(
         laws.REAR_WHEEL,
         "rear-wheel feedback (Samson 1992, Paden 2016)",
         {"k_e_1pm2": (0.02, 20.0), "k_theta_1pm": (0.1, 10.0)},
+        (1.0, 1.5),
     ),
     "lqr": Controller(
-        laws.LQR, "LQR with feedforward, delay-blind (Snider 2009)", {"q_e": (1e-3, 300.0), "q_theta": (1e-3, 100.0)}
+        laws.LQR,
+        "LQR with feedforward, delay-blind (Snider 2009)",
+        {"q_e": (1e-3, 300.0), "q_theta": (1e-3, 100.0)},
+        (1.0, 1.0),
     ),
     "lqr-preview": Controller(
         laws.LQR_PREVIEW,
         "LQR that knows lag and latency, with preview",
         {"q_e": (1e-3, 300.0), "q_theta": (1e-3, 100.0)},
+        (1.0, 1.0),
     ),
     "mpc": Controller(
         laws.MPC,
         "constrained MPC (OSQP), lag and latency known",
         {"q_e": (1e-3, 300.0), "q_theta": (1e-3, 100.0), "q_change": (1e-3, 100.0)},
+        (1.0, 1.0, 0.1),
     ),
     "pid": Controller(
-        laws.PID, "PID without feedforward", {"kp": (0.05, 20.0), "ki": (0.005, 10.0), "kd": (0.1, 10.0)}
+        laws.PID,
+        "PID without feedforward",
+        {"kp": (0.05, 20.0), "ki": (0.005, 10.0), "kd": (0.1, 10.0)},
+        (2.0, 0.4, 2.5),
     ),
     "pid+ff": Controller(
         laws.PID_FF,
         "PID with feedforward",
         {"kp": (0.05, 20.0), "ki": (0.005, 10.0), "kd": (0.1, 10.0), "ahead_s": (0.005, 0.5)},
+        (2.0, 0.4, 2.5, 0.1),
     ),
     "dob+pid": Controller(
         laws.DOB_PID,
         "Q/Gn DOB with lag and delay in it, PID, feedforward",
         {"kp": (0.05, 20.0), "kd": (0.1, 10.0), "length_m": (0.1, 10.0), "ahead_s": (0.005, 0.5)},
+        (2.0, 2.5, 1.0, 0.1),
     ),
-    "car": Controller(laws.CAR, "the shipped law, as shipped", {}),
+    "car": Controller(laws.CAR, "the shipped law, as shipped", {}, ()),
 }
 """All controllers. `car` brings its own estimator and takes its numbers from the shipped tables: it is not tuned here,
 and both its rows, `raw` and `estimator`, are the same runs."""
@@ -121,8 +134,7 @@ class LegFigures(NamedTuple):
 
 
 class RunFigures(NamedTuple):
-    """Figures of a run, forward and reverse leg, and whether it came to its end; else the figures are those until
-    then."""
+    """Figures of a run, forward and reverse leg; where it did not come to its end, those until then."""
 
     legs: tuple[LegFigures, LegFigures]
     completed: bool
@@ -231,7 +243,9 @@ class Driver:
                 raise solve.error
             if not end[manoeuvre.RAN_OUT]:
                 break
-        return RunFigures((_leg(error, notes, memory, 0), _leg(error, notes, memory, 1)), bool(end[manoeuvre.COMPLETED]))
+        return RunFigures(
+            (_leg(error, notes, memory, 0), _leg(error, notes, memory, 1)), bool(end[manoeuvre.COMPLETED])
+        )
 
 
 _DRIVES: list[Callable[..., None]] = []

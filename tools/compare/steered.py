@@ -1,8 +1,8 @@
 """The firmware's cycle with another steering law in it: everything else is the firmware's own.
 
-`step` stands where `firmware_py.core.controller.step` does and calls it: health, supervisor, manoeuvre, estimator, speed
-and gates run as ever. Only then the steering command is replaced by that of the law in question, cut by the same limits
-and rounded by the same gate. With the law `car` nothing is replaced.
+`step` stands where `firmware_py.core.controller.step` does and calls it: health, supervisor, manoeuvre, estimator,
+speed and gates run as ever. Only then the steering command is replaced by that of the law in question, cut by the same
+limits and rounded by the same gate. With the law `car` nothing is replaced.
 """
 
 import math
@@ -133,9 +133,7 @@ def _replaced(
     return state, Outputs(outputs.sys, steering, outputs.long, outputs.track)
 
 
-def see(
-    tables: Steered, before: controller.State, after: controller.State, inputs: Inputs, direction: int
-) -> Seen:
+def see(tables: Steered, before: controller.State, after: controller.State, inputs: Inputs, direction: int) -> Seen:
     """Return what the law is told: the newest pose as it came, or the estimator's state; the prediction of it.
 
     The prediction takes the motion of the firmware's own predictor over the latencies: those of pose and command for

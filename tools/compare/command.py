@@ -1,0 +1,394 @@
+"""`parkctl compare`: the controllers that people use beside the shipped one, on the same plant in the same runs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sim.errors import UserError
+from tools.run_folder import check_writable_file, write_whole
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from sim.data_files import Course, Vehicle
+    from tools.compare.rows import Both
+    from tools.compare.runs import RunFigures, Setting
+
+SCENARIOS = ("ideal", "quantised", "car-quiet", "car", "car-unknown-lag", "car-drift")
+SEEDS = 16
+FIRST_SEED = 2_000_000
+"""Of the measured runs; the training seeds lie far below."""
+
+MOST_SEEDS = 10_000
+SEEDS_A_TASK = 4
+RAW_SHARE = 0.5
+"""Greatest share that the shipped law's error in `car` may be of the best other one's on raw inputs."""
+
+Figures = dict[tuple[str, str, str], "list[RunFigures]"]
+"""Runs by (scenario, controller, inputs), in order of their seeds."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `parkctl compare`."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = """\
+Path, speed, gear changes, limits, plant, noise and seeds are the same for all; the steering law alone is exchanged.
+Inputs: `raw` is the newest pose as it comes, measured speed, yaw rate and wheel angle; `estimator` is the state of the
+firmware's own estimator, with the steering's disturbance that it has learnt taken off every law's command. `car`
+brings its estimator along, so its two rows are the same runs. All others were tuned alike, on other seeds
+(tools/compare/tunings.json); --tune does that again (a quarter of an hour), then compares.
+Errors are the rear axle's true ones against the path: max over all seeds, p95 over the seeds' maxima."""
+    what = parser.add_argument_group("what is compared")
+    what.add_argument(
+        "--scenario",
+        metavar="NAME|FILE",
+        action="append",
+        help=f"may be repeated (default: {', '.join(SCENARIOS)}; slow-rack is another)",
+    )
+    what.add_argument("--controller", metavar="NAME", action="append", help="may be repeated (default: all)")
+    what.add_argument("--inputs", choices=("raw", "estimator"), action="append", help="(default: both)")
+    what.add_argument("--seeds", type=int, default=SEEDS, metavar="N", help=f"runs of each (default: {SEEDS})")
+    what.add_argument("--seed", type=int, default=FIRST_SEED, metavar="N", help=f"the first (default: {FIRST_SEED})")
+    what.add_argument("--vehicle", default="paper", metavar="NAME|FILE", help="the car (default: paper)")
+    what.add_argument("--course", default="ohio", metavar="NAME|FILE", help="the course (default: ohio)")
+    how = parser.add_argument_group("how it is run")
+    how.add_argument("--tune", action="store_true", help="tune all controllers anew first and store the tunings")
+    how.add_argument("--tunings", type=Path, metavar="FILE", help="tunings (default: the shipped ones)")
+    how.add_argument("--jobs", type=int, metavar="N", help="processes (default: one for each core)")
+    out = parser.add_argument_group("what is written")
+    out.add_argument("--json", type=Path, metavar="FILE", help="the rows for machines")
+    out.add_argument("--plot", type=Path, metavar="FILE", help="the errors as a picture (.png)")
+
+
+class Prepared(NamedTuple):
+    """Everything checked and loaded, before the first run."""
+
+    vehicle: Vehicle
+    course: Course
+    settings: dict[str, Setting]
+    measured: list[str]
+    tables_dir: Path
+    controllers: list[str]
+    inputs: list[str]
+    seeds: list[int]
+    jobs: int
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare, print the table, write what was asked for; return the exit status."""
+    from rich.console import Console  # noqa: PLC0415
+
+    console = Console()
+    jobs = _check(args)
+    with ExitStack() as stack:
+        prepared = _prepare(args, jobs, stack)
+        tunings = _tunings(args, prepared)
+        begun_s = time.monotonic()
+        figures = _measure(prepared, tunings.numbers)
+        rows = _rows(prepared, tunings.numbers, figures)
+        _report(args, console, prepared, figures, rows, tunings.stale, time.monotonic() - begun_s)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> int:
+    """Check what can be checked without loading anything; return the number of processes."""
+    if not 1 <= args.seeds <= MOST_SEEDS:
+        raise UserError(f"--seeds {args.seeds}: must be from 1 to {MOST_SEEDS}")
+    if args.seed < 1000:
+        raise UserError(f"--seed {args.seed}: must be at least 1000; those below are for tuning")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jobs: int = cores if args.jobs is None else args.jobs
+    if not 1 <= jobs <= 256:
+        raise UserError(f"--jobs {jobs}: must be from 1 to 256")
+    for file in (args.json, args.plot):
+        if file is not None:
+            check_writable_file(file)
+    if args.plot is not None and args.plot.suffix != ".png":
+        raise UserError(f"--plot {args.plot}: name a file that ends in .png")
+    if args.tune and args.tunings is not None:
+        check_writable_file(args.tunings)
+    return jobs
+
+
+def _prepare(args: argparse.Namespace, jobs: int, stack: ExitStack) -> Prepared:
+    from sim.data_files import load_course, load_scenario, load_vehicle  # noqa: PLC0415
+    from tools.compare import procedure  # noqa: PLC0415
+    from tools.compare.runs import CONTROLLERS, INPUTS  # noqa: PLC0415
+
+    controllers = list(dict.fromkeys(args.controller or CONTROLLERS))
+    for name in controllers:
+        if name not in CONTROLLERS:
+            raise UserError(f"--controller {name}: there is no such one; there are {', '.join(CONTROLLERS)}")
+    names = list(dict.fromkeys(args.scenario or SCENARIOS))
+    wanted = {name: load_scenario(name) for name in names}
+    for name, scenario in wanted.items():
+        if scenario.faults:
+            raise UserError(f"--scenario {name}: has [[faults]]; a comparison drives without")
+    if args.tune:
+        wanted |= {name: load_scenario(name) for name in procedure.SCENARIOS if name not in wanted}
+    vehicle = load_vehicle(args.vehicle)
+    course = load_course(args.course)
+    made: dict[str, Path] = {}
+    settings = {name: _setting(args.vehicle, scenario, course, made, stack) for name, scenario in wanted.items()}
+    tables_dir = _tables(vehicle, course, made, stack)
+    inputs = [name for name in INPUTS if name in (args.inputs or INPUTS)]
+    seeds = list(range(args.seed, args.seed + args.seeds))
+    return Prepared(vehicle, course, settings, names, tables_dir, controllers, inputs, seeds, jobs)
+
+
+def _setting(vehicle: str, scenario: Any, course: Course, made: dict[str, Path], stack: ExitStack) -> Setting:
+    from sim.data_files import load_vehicle  # noqa: PLC0415
+    from tools.compare.runs import setting_of  # noqa: PLC0415
+
+    with_overlay = load_vehicle(vehicle, scenario.vehicle_overlay)
+    return setting_of(with_overlay, course, scenario, _tables(with_overlay, course, made, stack))
+
+
+def _tables(vehicle: Vehicle, course: Course, made: dict[str, Path], stack: ExitStack) -> Path:
+    """Return the folder of tables for a car: the shipped one, or one designed now, once a car."""
+    from sim.data_files import check_fit  # noqa: PLC0415
+    from tools.design.tables import design_tables, tables_folder  # noqa: PLC0415
+
+    check_fit(vehicle, course)
+    key = f"{vehicle.hash24:06x}"
+    if key not in made:
+        shipped = tables_folder(vehicle, course)
+        if shipped is None:
+            print(f"making tables of {vehicle.name} for a scenario's car", file=sys.stderr, flush=True)
+            shipped = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="parkctl-tables-"))) / "tables"
+            design_tables(vehicle, course, shipped)
+        made[key] = shipped
+    return made[key]
+
+
+def _tunings(args: argparse.Namespace, prepared: Prepared) -> Any:
+    """Return the stored tunings, made anew where asked for; say so where they are not of this car, path and code."""
+    from tools.compare import procedure  # noqa: PLC0415
+
+    file = args.tunings or procedure.STORED
+    if args.tune:
+        _tune(prepared, file)
+    stored = procedure.load(file, prepared.vehicle, prepared.course, prepared.tables_dir)
+    if stored.stale:
+        print(
+            f"parkctl: warning: {file.name}: the tunings are stale ({'; '.join(stored.stale)}); "
+            "`parkctl compare --tune` makes them anew",
+            file=sys.stderr,
+        )
+    return stored
+
+
+def _compile(prepared: Prepared) -> None:
+    """Compile here first, so that the processes find it done; a run is what makes numba compile."""
+    from tools.compare.runs import CONTROLLERS, Driver, is_compiled  # noqa: PLC0415
+
+    if not is_compiled():
+        print("compiling core, plant and controllers, once for this version (a minute)", file=sys.stderr, flush=True)
+        Driver(next(iter(prepared.settings.values()))).run(CONTROLLERS["car"].law, (), "estimator", FIRST_SEED)
+
+
+def _tune(prepared: Prepared, file: Path) -> None:
+    from tools.compare import procedure, work  # noqa: PLC0415
+    from tools.compare.runs import CONTROLLERS  # noqa: PLC0415
+    from tools.progress import CountProgress  # noqa: PLC0415
+
+    _compile(prepared)
+    settings = {name: prepared.settings[name] for name in procedure.SCENARIOS}
+    parts = [(name, inputs) for name, it in CONTROLLERS.items() if it.box for inputs in it.inputs]
+    parts.sort(key=lambda part: part[0] != "mpc")  # what takes longest, first
+    progress = CountProgress("tuning", "tunings", len(parts))
+    progress.show(time.monotonic(), 0)
+    found = {}
+    try:
+        for (name, inputs), tuned in work.spread(work.tune_one, parts, settings, prepared.jobs):
+            found[name, inputs] = tuned
+            progress.show(time.monotonic(), len(found), f"{name} {inputs}: {1e3 * tuned.cost_m:.1f} mm")
+    finally:
+        progress.close()
+    by_name = {
+        name: {inputs: found[name, inputs] for inputs in it.inputs} for name, it in CONTROLLERS.items() if it.box
+    }
+    procedure.store(file, by_name, prepared.vehicle, prepared.course, prepared.tables_dir)
+
+
+def _measure(prepared: Prepared, numbers: dict[tuple[str, str], tuple[float, ...]]) -> Figures:
+    from tools.compare import work  # noqa: PLC0415
+    from tools.compare.runs import CONTROLLERS, ESTIMATOR  # noqa: PLC0415
+    from tools.progress import CountProgress  # noqa: PLC0415
+
+    _compile(prepared)
+    tasks = []
+    for scenario in prepared.measured:
+        for name in prepared.controllers:
+            given = [ESTIMATOR] if not CONTROLLERS[name].box else prepared.inputs
+            for inputs in given:
+                for first in range(0, len(prepared.seeds), SEEDS_A_TASK):
+                    seeds = tuple(prepared.seeds[first : first + SEEDS_A_TASK])
+                    tasks.append(work.Task(name, inputs, scenario, numbers.get((name, inputs), ()), seeds))
+    tasks.sort(key=lambda task: task.controller != "mpc")  # what takes longest, first
+    total = sum(len(task.seeds) for task in tasks)
+    progress = CountProgress("compare", "runs", total)
+    progress.show(time.monotonic(), 0)
+    done = 0
+    by_seed: dict[tuple[str, str, str], dict[int, RunFigures]] = {}
+    try:
+        for task, runs in work.spread(work.drive_task, tasks, prepared.settings, prepared.jobs):
+            key = (task.scenario, task.controller, task.inputs)
+            by_seed.setdefault(key, {}).update(zip(task.seeds, runs, strict=True))
+            done += len(runs)
+            progress.show(time.monotonic(), done)
+    finally:
+        progress.close()
+    figures: Figures = {}
+    for scenario in prepared.measured:
+        for name in prepared.controllers:
+            for inputs in prepared.inputs:
+                driven = inputs if CONTROLLERS[name].box else ESTIMATOR
+                runs_of = by_seed[scenario, name, driven]
+                figures[scenario, name, inputs] = [runs_of[seed] for seed in prepared.seeds]
+    return figures
+
+
+# -- what came out ----------------------------------------------------------------------------------------------------
+
+
+def _rows(
+    prepared: Prepared, numbers: dict[tuple[str, str], tuple[float, ...]], figures: Figures
+) -> list[dict[str, Any]]:
+    from tools.compare.rows import DIRECTIONS, row_of, tick_us  # noqa: PLC0415
+
+    tables = next(iter(prepared.settings.values())).shared.tables["left"]
+    taken = {
+        (name, inputs): tick_us(name, numbers.get((name, inputs), ()), tables)
+        for name in prepared.controllers
+        for inputs in prepared.inputs
+    }
+    return [
+        row_of(name, inputs, scenario, prepared.vehicle.name, leg, runs, taken[name, inputs])
+        for (scenario, name, inputs), runs in figures.items()
+        for leg in range(len(DIRECTIONS))
+    ]
+
+
+class Verdict(NamedTuple):
+    """A claim about the shipped law and what was measured: errors in m of it and of the best other one."""
+
+    claim: str
+    car_m: float
+    best_other_m: float
+    best_other: str
+    holds: bool
+
+
+def verdicts(figures: Figures) -> list[Verdict]:
+    """Return the claims that these runs allow to judge, by the greatest error over both legs of all runs."""
+    from tools.compare.rows import both_of  # noqa: PLC0415
+
+    claims = (
+        ("car", "raw", RAW_SHARE, "at most half of the best other on raw inputs"),
+        ("car", "estimator", 1.0, "no worse than the best other behind the same estimator"),
+        ("car-unknown-lag", "raw", 1.0, "better than every other on raw inputs"),
+    )
+    judged = []
+    for scenario, inputs, share, text in claims:
+        errors = {
+            name: both_of(runs).max_m
+            for (where, name, how), runs in figures.items()
+            if (where, how) == (scenario, inputs)
+        }
+        others = {name: error for name, error in errors.items() if name != "car"}
+        if "car" not in errors or not others:
+            continue
+        best = min(others, key=lambda name: others[name])
+        holds = errors["car"] <= share * others[best]
+        judged.append(Verdict(f"{scenario}: {text}", errors["car"], others[best], best, holds))
+    return judged
+
+
+def _report(
+    args: argparse.Namespace,
+    console: Console,
+    prepared: Prepared,
+    figures: Figures,
+    rows: list[dict[str, Any]],
+    stale: list[str],
+    passed_s: float,
+) -> None:
+    from tools.compare.rows import both_of  # noqa: PLC0415
+
+    both = {key: both_of(runs) for key, runs in figures.items()}
+    ticks = {(row["controller"], row["inputs"]): row["tick_us"] for row in rows}
+    _print(console, prepared, both, ticks)
+    judged = verdicts(figures)
+    for verdict in judged:
+        console.print(
+            f"{'yes' if verdict.holds else 'NO '}  {verdict.claim}: {1e3 * verdict.car_m:.2f} mm, "
+            f"{verdict.best_other} {1e3 * verdict.best_other_m:.2f} mm",
+            soft_wrap=True,
+            highlight=False,
+        )
+    console.print(f"{len(prepared.seeds)} seeds from {prepared.seeds[0]}, {passed_s / 60.0:.1f} min", highlight=False)
+    if args.json is not None:
+        content = {
+            "seeds": prepared.seeds,
+            "seconds": passed_s,
+            "stale_tunings": stale,
+            "claims": [verdict._asdict() for verdict in judged],
+            "rows": rows,
+        }
+        write_whole(args.json, json.dumps(content, indent=1) + "\n")
+    if args.plot is not None:
+        from tools.plots.compare import compare_picture  # noqa: PLC0415
+
+        compare_picture(args.plot, both, title=_title(prepared))
+        console.print(f"picture: {args.plot}", soft_wrap=True, highlight=False)
+
+
+def _title(prepared: Prepared) -> str:
+    return (
+        f"true cross-track error of the rear axle in mm, {prepared.vehicle.name} on {prepared.course.name}, "
+        f"both legs, {len(prepared.seeds)} runs each"
+    )
+
+
+def _print(
+    console: Console,
+    prepared: Prepared,
+    both: dict[tuple[str, str, str], Both],
+    ticks: dict[tuple[str, str], float],
+) -> None:
+    """Print a table for each kind of input: a line a controller, a column a scenario."""
+    from rich.table import Table  # noqa: PLC0415
+
+    for inputs in prepared.inputs:
+        of = "raw inputs" if inputs == "raw" else "behind the same estimator"
+        table = Table(title=f"{of}: cross-track max / rms in mm", title_justify="left", padding=(0, 0))
+        table.add_column("", no_wrap=True)
+        for scenario in prepared.measured:
+            table.add_column(prepared.settings[scenario].scenario.name, justify="right")
+        table.add_column("us", justify="right", no_wrap=True)
+        for name in prepared.controllers:
+            cells = [_cell(both[scenario, name, inputs]) for scenario in prepared.measured]
+            style = "bold" if name == "car" else None
+            table.add_row(name, *cells, f"{ticks[name, inputs]:.0f}", style=style)
+        console.print(table)
+    console.print(
+        "us: the law alone in a cycle, in CPython; * some runs were stopped by the supervisor", highlight=False
+    )
+
+
+def _cell(figures: Both) -> str:
+    return f"{_millimetres(figures.max_m)}/{_millimetres(figures.rms_m)}{'*' if figures.stopped else ''}"
+
+
+def _millimetres(error_m: float) -> str:
+    error = 1e3 * error_m
+    return f"{error:.0f}" if error >= 99.5 else f"{error:.1f}" if error >= 9.95 else f"{error:.2f}"
