@@ -98,7 +98,7 @@ def fit(tell: Callable[[str], None] = print) -> StoredFit:
     best, best_numbers = math.inf, drawing
     for number in range(STARTS):
         begin = drawing if number == 0 else drawing + 0.7 * scale * rng.normal(size=len(drawing))
-        answer = least_squares(lambda z: _waypoint_residuals(z, cells), begin, diff_step=1e-3, max_nfev=60)
+        answer = least_squares(lambda z: waypoint_residuals(z, cells), begin, diff_step=1e-3, max_nfev=60)
         tell(f"waypoints, start {number + 1} of {STARTS}: cost {answer.cost:.5f}")
         if answer.cost < best:
             best, best_numbers = float(answer.cost), answer.x
@@ -140,7 +140,8 @@ def _errors(figures: list[Figures], law: str, rate_weight: float) -> Floats:
     return np.concatenate(rows)
 
 
-def _waypoint_residuals(numbers_ft: Floats, cells: Cells) -> Floats:
+def waypoint_residuals(numbers_ft: Floats, cells: Cells) -> Floats:
+    """What the fit of the waypoints makes small: relative errors of the DOB's cells (8,), then the pull (4,)."""
     pull = PULL * (numbers_ft - np.array(DRAWING)) / np.array(SCALE)
     try:
         errors = _errors(cells.figures(printed_path(waypoints_of(numbers_ft))), DOB, RATE_WEIGHT)

@@ -33,6 +33,7 @@ thead th{border-bottom:2px solid var(--ink);text-align:right}
 thead th:first-child{text-align:left}
 caption{text-align:left;font-weight:600;padding:.3rem 0}
 .scroll{overflow-x:auto}
+.words td,.words thead th{text-align:left}
 td.bad{color:var(--wrong);font-weight:600}
 td.good{color:var(--ours)}
 .eq{font-family:"STIX Two Math","Cambria Math",Georgia,serif;background:#f6f8fa;padding:.5rem 1rem;
@@ -65,8 +66,8 @@ def equation(text: str) -> str:
     return f'<div class="eq">{text}</div>'
 
 
-def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; cells are HTML, a cell that begins with "!" is marked bad, with "+" good."""
+def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool = False) -> str:
+    """A table; cells are HTML, a cell that begins with "!" is marked bad, with "+" good; words stand to the left."""
     columns = "".join(f"<th>{cell}</th>" for cell in head)
     lines = []
     for row in rows:
@@ -75,8 +76,9 @@ def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> s
             mark = {"!": ' class="bad"', "+": ' class="good"'}.get(cell[:1], "")
             cells.append(f"<td{mark}>{cell[1:] if mark else cell}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
+    kind = ' class="words"' if words else ""
     return (
-        f'<div class="scroll"><table><caption>{caption}</caption><thead><tr>{columns}</tr></thead>'
+        f'<div class="scroll"><table{kind}><caption>{caption}</caption><thead><tr>{columns}</tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
 

@@ -28,7 +28,7 @@ def write(folder: Path, study: Study, loops: Loops, content: dict[str, Any], tel
     )
     sections = [
         ("summary", "What holds and what does not", page_runs.summary(study, content, picture)),
-        ("path", "Path: eq. 1 to 10, Table 1, Figures 1 to 5", page_path.path(study, picture)),
+        ("path", "Path: eq. 1 to 10, Table 1, Figures 1 to 5", page_path.path(study, content, picture)),
         ("model", "Model: eq. 11, Table 2, Figure 6", page_path.model(study, content, picture)),
         ("speed", "Speed and preview: Table 3, Figure 7", page_path.speed(study, content, picture)),
         ("dob", "Disturbance observer: eq. 12 to 18, Figures 8 to 10", page_loop.observer(loops, picture)),

@@ -13,7 +13,7 @@ from tools.paper.study import Study
 Picture = Callable[[str, str], str]
 
 
-def path(study: Study, picture: Picture) -> str:
+def path(study: Study, content: dict[str, Any], picture: Picture) -> str:
     """Eq. 1 to 10."""
     figures = {name: result.figures() for name, result in study.paths.items()}
     rows = [
@@ -56,6 +56,11 @@ def path(study: Study, picture: Picture) -> str:
             ),
             picture("figure_02", "Figure 2. Sample waypoints and what modified Akima interpolation makes of them."),
             picture("figure_03", "Figure 3. Waypoints in four segments."),
+            table(
+                "Table 1. Setting parameters",
+                ("", "paper", "ours"),
+                [(k, str(c["paper"]), str(c["ours"])) for k, c in content["table1"].items()],
+            ),
             note(
                 OURS,
                 "Eq. 9 is a linear least-squares problem with linear constraints; no optimiser is needed. "
@@ -200,7 +205,7 @@ def model(study: Study, content: dict[str, Any], picture: Picture) -> str:
                 "B<sub>22</sub> printed: + C<sub>r</sub> l<sub>r</sub> / I<sub>z</sub>, &nbsp; right: "
                 "&minus; C<sub>r</sub> l<sub>r</sub> / I<sub>z</sub>"
             ),
-            table("Table 2. Parameters", ("symbol", "paper", "here"), table_2),
+            table("Table 2. Parameters", ("symbol", "paper", "here"), table_2, words=True),
             note(
                 WRONG,
                 "A force at the rear axle to the left turns the car to the right: B<sub>22</sub> is "

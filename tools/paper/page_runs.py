@@ -86,7 +86,7 @@ def summary(study: Study, content: dict[str, Any], picture: Picture) -> str:
     return "".join(
         [
             f'<div class="big">{big}</div>',
-            table("The paper's claims", ("claim", "holds", ""), claims),
+            table("The paper's claims", ("claim", "holds", ""), claims, words=True),
             picture(
                 "cells",
                 "Tables 5 and 6: ours over printed. Waypoints and gains are fitted to the green and "

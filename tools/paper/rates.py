@@ -89,16 +89,17 @@ def study_rates(car: PaperCar, gains: Gains, paths: dict[str, PathResult]) -> Ra
                 )  # fmt: skip
         track = track_of(paths[AS_PRINTED].path, direction)
         kicks[direction] = {
-            law: np.array([_kick(car, direction, Law(law, gains), track, step) for step in KICK_STEPS_S])
+            law: np.array([kick_radps(car, direction, Law(law, gains), track, step) for step in KICK_STEPS_S])
             for law in (DOB, PID, BOTH)
         }
         printed_step[direction] = _step_for(TABLES_5_6[direction][PID].max_steer_rate_radps, kicks[direction][PID])
     return Rates(runs, np.array(KICK_STEPS_S), kicks, printed_step)
 
 
-def _kick(car: PaperCar, direction: str, law: Law, track: Track, step_s: float) -> float:
+def kick_radps(car: PaperCar, direction: str, law: Law, track: Track, step_s: float) -> float:
     """Peak rate of the first 0.05 s from a start on the path."""
-    whole = motion(track.station_m[:200], track.curvature_1pm[:200] * 0.0, TABLE_3._replace(min_speed_mps=0.1), step_s)
+    begin = slice(0, int(np.searchsorted(track.station_m, 0.5)))
+    whole = motion(track.station_m[begin], np.zeros(begin.stop), TABLE_3, step_s)
     count = min(round(KICK_TIME_S / step_s), len(whole.mid_speed_mps) - 1)
     plan = Motion(
         whole.time_s[: count + 1],

@@ -45,7 +45,7 @@ def figure_1(study: Study, stem: Path) -> None:
         ("left", 1.0, "(a) lane change to the left"),
         ("right", -1.0, "(b) lane change to the right"),
     )
-    figure, axes = sheet(1, 2, width=13.0, height=4.2, sharey=True)
+    figure, axes = sheet(1, 2, width=13.0, height=3.2, sharey=True)
     x, y, yaw = rear_axle_poses(study)
     for one, (side, sign, title) in zip(axes, sides, strict=True):
         course(one, study.course, side)
