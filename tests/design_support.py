@@ -1,18 +1,18 @@
-"""What the design's tests share: a straight leg for the firmware's own functions, and the car behind its delay."""
+"""What the design's tests share: the firmware's own functions on a straight leg, and a car behind its delay."""
 
 import math
 from functools import cache
 
-from firmware_py.core import observer, pid, predictor
-from firmware_py.core.motion import PathState
-from firmware_py.core.path import locate
-from firmware_py.core.schedule import Gains
-from firmware_py.core.tables import CarTable, LegTable
+from firmware_py.core import estimator, pid, predictor
+from firmware_py.core.motion import QUEUE_LENGTH
+from firmware_py.core.schedule import gains_at
+from firmware_py.core.tables import GainTable
 from sim.data_files import load_scenario, load_vehicle
 from tools.design import gains as design
-from tools.design.model import Corner, Nominal, Row
+from tools.design.model import Corner, Mode, Nominal, Row, nominal_car, straight_leg
 
 PERIOD_S = 0.01
+NOMINAL = Nominal(4.0, 0.1, 1, 1)
 
 
 def vehicle_of(name="paper", scenario=None, **overlay):
@@ -30,112 +30,95 @@ def row_at(table, direction, speed_mps):
     return next(Row(*row) for row in table if row[:2] == (direction, speed_mps))
 
 
-def straight_leg(direction):
-    """Leg of 1000 m along x, driven with body yaw 0 (forward) or backwards to the origin (reverse)."""
-    length = 1000.0
-    x = (0.0, length) if direction > 0 else (length, 0.0)
-    zero = (0.0, 0.0)
-    return LegTable(
-        sigma=direction,
-        step_m=length,
-        length_m=length,
-        last_row=1,
-        x_m=x,
-        y_m=zero,
-        yaw_rad=zero,
-        curvature_1pm=zero,
-        slip_heading_rad=zero,
-        feedforward_curvature_1pm=zero,
-        feedforward_slope_1pm2=zero,
-        speed_mps=(1.0, 1.0),
-        accel_mps2=zero,
-    )
+def corner(**values):
+    """The paper's car; keywords as the fields of a corner."""
+    own = Corner("", 0.1, 1, 1.0, 1.0, 4.0, 2.0, 3000.0, 5113.0, 3e5, 3e5)
+    return own._replace(**values)
 
 
-def car_table(nominal: Nominal, wheelbase_m=4.0, max_rate_radps=100.0):
-    lag = nominal.steering_lag_s
-    alpha = 1.0 if lag == 0.0 else 1.0 - math.exp(-PERIOD_S / lag)
-    return CarTable(
-        wheelbase_m=wheelbase_m,
-        steering_lag_s=lag,
-        lag_alpha=alpha,
-        lag_mean_weight=0.0 if lag == 0.0 else lag / PERIOD_S * alpha,
-        pose_latency_samples=min(1, nominal.latency_samples),
-        command_latency_samples=nominal.latency_samples - min(1, nominal.latency_samples),
-        drive_lag_s=0.3,
-        brake_lag_s=0.1,
-        gear_change_s=0.5,
-        max_road_wheel_angle_rad=0.5,
-        max_road_wheel_rate_radps=max_rate_radps,
-        max_speed_mps=1.0,
-        controlled_decel_mps2=1.0,
-        emergency_decel_mps2=2.4,
-    )
+def known_exactly(vehicle):
+    """The vehicle with nothing uncertain but the steering's gain: few corners."""
+    return type(vehicle)(**{**vars(vehicle), "box": {key: (getattr(vehicle, key),) * 2 for key in vehicle.box}})
 
 
 class FirmwareLaw:
-    """Observer, predictor and PID of the firmware on a straight leg at constant speed, limits out of the way."""
+    """Estimator, predictor and PID of the firmware on a straight leg at constant speed, limits out of the way."""
 
-    def __init__(self, row: Row, nominal: Nominal, predicts=True):
+    def __init__(self, row: Row, nominal: Nominal, mode: Mode = Mode()):  # noqa: B008
         self.leg = straight_leg(row.direction)
-        self.car = car_table(nominal)
-        self.gains = Gains(*row[2:])
+        self.car = nominal_car(nominal)
+        self.mode = mode
         self.speed_mps = row.speed_mps
-        self.predicts = predicts
-        self.observed = observer.begin(100.0, 0.0)
+        table = GainTable((0.0, row.speed_mps), 1, ((row[2:], row[2:]),) * 2)
+        self.gains = gains_at(table, 0, row.speed_mps, int(mode.with_yaw_rate))
+        self.x_m = 100.0 if row.direction > 0 else 900.0
+        self.poses_x = [self.x_m] * 60
+        self.state = estimator.begin()._replace(x_m=self.x_m, station_m=100.0)
         self.integral_m2 = 0.0
-        self.sent_rad = (0.0,) * predictor.QUEUE_LENGTH
+        self.sent_rad = (0.0,) * QUEUE_LENGTH
 
-    def command_rad(self, e_m, heading_rad):
-        """One cycle: the pose's cross-track and heading error in, the road-wheel angle out."""
+    def command_rad(self, e_m, yaw_rad, yaw_rate_radps, angle_rad):
+        """One cycle: what the reports say in, the road-wheel angle out."""
         leg, car, sigma = self.leg, self.car, self.leg.sigma
-        acted = self.sent_rad[car.pose_latency_samples + car.command_latency_samples]
-        observed = observer.predict_to_pose(leg, car, self.observed, acted, self.speed_mps, PERIOD_S)
-        at = locate(leg, observed.path.station_m)
-        error = observer.innovation(leg, observed, at.x_m, at.y_m + e_m, heading_rad)
-        observed = observer.correct_moving(observed, self.gains, error)
-        assert observed.disbelieved == 0
-        self.observed = observed
-        ahead = observed.path
-        if self.predicts:
-            ahead = predictor.predict(leg, car, ahead, self.sent_rad, self.speed_mps, PERIOD_S)
-        feedback = pid.feedback_1pm(
-            ahead.cross_track_error_m, ahead.heading_error_rad, self.integral_m2, self.gains, sigma
+        ds_m = self.speed_mps * PERIOD_S
+        self.x_m += sigma * ds_m
+        self.poses_x.append(self.x_m)
+        n = car.command_latency_samples
+        acted = self.sent_rad[n] + car.late_weight * (self.sent_rad[n + 1] - self.sent_rad[n])
+        motion = estimator.Motion(
+            ds_m, PERIOD_S, acted, angle_rad, 1, yaw_rate_radps, int(self.mode.with_yaw_rate), 0, 1
         )
-        angle = math.atan(-car.wheelbase_m * (feedback + ahead.curvature_disturbance_1pm))
-        preview = pid.preview_error_m(ahead.cross_track_error_m, ahead.heading_error_rad, self.gains.preview_m, sigma)
-        self.integral_m2 = pid.integrate_m2(self.integral_m2, preview, self.speed_mps * PERIOD_S, self.gains, 0)
+        latency = car.pose_latency_samples if self.mode.predicts else 0
+        pose_x_m = self.poses_x[-1 - latency]
+        self.state = estimator.estimate(leg, car, self.gains, self.state, motion, 1, pose_x_m, e_m, yaw_rad, latency)
+        assert self.state.disbelieved == 0
+        _, e, heading = predictor.predict(leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S)
+        if not self.mode.predicts:
+            e, heading = self.state.cross_track_error_m, self.state.heading_error_rad
+        feedback = pid.feedback_1pm(e, heading, self.integral_m2, self.gains, sigma)
+        angle = math.atan(-car.wheelbase_m * feedback)
+        angle = (angle - self.state.road_disturbance_rad - self.state.steering_offset_rad) / self.state.steering_gain
+        preview = pid.preview_error_m(e, heading, self.gains.preview_m, sigma)
+        self.integral_m2 = pid.integrate_m2(self.integral_m2, preview, ds_m, self.gains, 0)
         self.sent_rad = (angle, *self.sent_rad[:-1])
         return angle
 
 
 class StraightRoad:
-    """A car on a straight road in small steps of time: dead time, first-order lag, exact arc; nothing linearised."""
+    """A car on a straight road in small steps of time: dead time, first-order lag, exact arc; nothing linearised.
+
+    It has no tyres: they answer within a cycle or two at walking speed.
+    """
 
     STEPS = 10  # a cycle
 
-    def __init__(self, corner: Corner, speed_mps, direction, e_m=0.0, wheelbase_m=4.0):
-        self.corner, self.wheelbase_m = corner, wheelbase_m
+    def __init__(self, corner: Corner, speed_mps, direction, e_m=0.0):
+        self.corner = corner
         self.velocity_mps = direction * speed_mps
-        self.e_m, self.heading_rad, self.wheel_rad = e_m, 0.0, 0.0
-        self.late_steps = round(corner.latency_samples * self.STEPS)
-        self.line = [0.0] * self.late_steps
+        self.e_m, self.yaw_rad, self.rack_rad, self.yaw_rate_radps = e_m, 0.0, 0.0, 0.0
+        self.line = [0.0] * round((corner.command_latency_samples + 0.4) * self.STEPS)
+        self.poses = [(e_m, 0.0)] * (corner.pose_latency_samples + 1)
+
+    def reports(self):
+        """Pose (late), yaw rate and measured angle."""
+        return (*self.poses[-1 - self.corner.pose_latency_samples], self.yaw_rate_radps, self.rack_rad)
 
     def drive(self, command_rad):
-        """One cycle with a command; the pose's latency is part of the dead time."""
+        """One cycle, from reports to reports, with the command that the reports led to."""
         h = PERIOD_S / self.STEPS
         lag = self.corner.steering_lag_s
         answer = 1.0 if lag == 0.0 else 1.0 - math.exp(-h / lag)
-        self.line += [command_rad] * self.STEPS
+        self.line += [self.corner.steering_gain * command_rad] * self.STEPS
         for target in self.line[: self.STEPS]:
-            behind = target - self.wheel_rad
+            behind = target - self.rack_rad
             mean_rad = target - behind * lag / h * answer
-            self.wheel_rad += answer * behind
-            curvature = self.corner.gain * math.tan(mean_rad) / self.wheelbase_m
-            turned = curvature * self.velocity_mps * h
-            self.e_m += self.velocity_mps * h * math.sin(self.heading_rad + 0.5 * turned)
-            self.heading_rad += turned
+            self.rack_rad += answer * behind
+            turned = math.tan(mean_rad) / self.corner.wheelbase_m * self.velocity_mps * h
+            self.e_m += self.velocity_mps * h * math.sin(self.yaw_rad + 0.5 * turned)
+            self.yaw_rad += turned
+        self.yaw_rate_radps = math.tan(self.rack_rad) / self.corner.wheelbase_m * self.velocity_mps
         del self.line[: self.STEPS]
+        self.poses.append((self.e_m, self.yaw_rad))
 
 
 def drive(law: FirmwareLaw, road: StraightRoad, cycles):
@@ -143,16 +126,7 @@ def drive(law: FirmwareLaw, road: StraightRoad, cycles):
     errors = []
     for _ in range(cycles):
         errors.append(road.e_m)
-        if abs(road.e_m) > 0.1 or abs(road.heading_rad) > 0.06:
+        if abs(road.e_m) > 0.1 or abs(road.yaw_rad) > 0.06 or abs(road.rack_rad) > 0.5:
             break
-        road.drive(law.command_rad(road.e_m, road.heading_rad))
+        road.drive(law.command_rad(*road.reports()))
     return errors
-
-
-def station_state(state: PathState):
-    return (
-        state.cross_track_error_m,
-        state.heading_error_rad,
-        state.curvature_disturbance_1pm,
-        state.road_wheel_angle_rad,
-    )

@@ -6,28 +6,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from design_support import (
-    PERIOD_S,
-    FirmwareLaw,
-    StraightRoad,
-    car_table,
-    designed,
-    row_at,
-    station_state,
-    straight_leg,
-    vehicle_of,
-)
+from design_support import NOMINAL, FirmwareLaw, corner, designed, row_at, vehicle_of
 
-from firmware_py.core.motion import PathState, advance
 from firmware_py.core.schedule import gains_at
-from firmware_py.core.tables import GainTable
+from firmware_py.core.tables import GAIN_COLUMNS, L_EE, M_EE, GainTable
 from firmware_py.table_file import GAINS_COLUMNS
+from sim import vehicle as plant
 from sim.errors import UserError
 from tools.design import gains as design
 from tools.design import model
 
-WHEELBASE_M = 4.0
 DIRECTIONS = (1.0, -1.0)
+RUNS = [(law, mode) for law, modes in design.MODES.items() for mode in modes]
 
 
 def rows_of(table, direction):
@@ -37,96 +27,118 @@ def rows_of(table, direction):
 # The linear model
 
 
+class PlantInSmallSteps:
+    """The emulator's single-track plant behind a lag and a dead time, in steps of 0.5 ms."""
+
+    STEPS = 20
+
+    def __init__(self, car, velocity_mps):
+        self.car, self.velocity_mps = car, velocity_mps
+        self.parameters = plant.plant_parameters(
+            car.mass_kg,
+            car.yaw_inertia_kgm2,
+            car.wheelbase_m,
+            car.cg_to_rear_axle_m,
+            car.stiffness_front_n_per_rad,
+            car.stiffness_rear_n_per_rad,
+            10.0,
+            1e-4,
+        )
+        self.state = plant.state_at_rest(self.parameters, 0.0, 0.0, 0.0)._replace(speed_mps=velocity_mps)
+        self.rack_rad = 0.0
+        self.line = [0.0] * round((car.command_latency_samples + 0.35) * self.STEPS)
+        self.poses = [(0.0, 0.0)] * (car.pose_latency_samples + 1)
+
+    def reports(self):
+        return (*self.poses[-1 - self.car.pose_latency_samples], self.state.yaw_rate_radps, self.rack_rad)
+
+    def drive(self, command_rad):
+        h = model.PERIOD_S / self.STEPS
+        self.line += [self.car.steering_gain * command_rad] * self.STEPS
+        for target in self.line[: self.STEPS]:
+            self.rack_rad += (target - self.rack_rad) * (1.0 - math.exp(-h / self.car.steering_lag_s))
+            self.state = plant.step(self.parameters, self.state, self.velocity_mps, self.rack_rad, h)
+        del self.line[: self.STEPS]
+        _, y_m, yaw_rad = plant.rear_axle_pose(self.parameters, self.state)
+        self.poses.append((y_m, yaw_rad))
+
+
 @pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize("lag_s", [0.0, 0.1, 0.27])
-def test_the_observers_model_is_the_firmwares_motion_linearised(direction, lag_s):
-    leg, car = straight_leg(direction), car_table(model.Nominal(lag_s, 2))
-    f, g = model.motion(0.7, direction, lag_s)
-    tiny = 1e-6
-
-    def moved(values, command):
-        e, heading, disturbance, curvature = values
-        state = PathState(100.0, e, heading, disturbance, math.atan(WHEELBASE_M * curvature))
-        after = station_state(advance(leg, car, state, math.atan(WHEELBASE_M * command), 0.7, PERIOD_S))
-        return np.array([*after[:3], math.tan(after[3]) / WHEELBASE_M])
-
-    for column in range(4):
-        change = tiny * np.eye(4)[column]
-        assert (moved(change, 0.0) - moved(-change, 0.0)) / (2 * tiny) == pytest.approx(f[:, column], abs=1e-9)
-    assert (moved(np.zeros(4), tiny) - moved(np.zeros(4), -tiny)) / (2 * tiny) == pytest.approx(g, abs=1e-9)
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize(("lag_s", "latency"), [(0.1, 2.3), (0.0, 0.0), (0.0, 0.3), (0.27, 5.0), (0.2, 0.8)])
-def test_the_cars_model_is_a_car_driven_in_small_steps(direction, lag_s, latency):
-    corner = model.Corner("", lag_s, latency, 0.9)
-    system = model.car(corner, 0.8, direction)
-    road = StraightRoad(corner, 0.8, direction)
+@pytest.mark.parametrize("speed_mps", [1.0, 0.3])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"pose_latency_samples": 0, "command_latency_samples": 0.0, "steering_lag_s": 0.05},
+        {"pose_latency_samples": 2, "command_latency_samples": 3.0, "mass_kg": 3900.0, "steering_gain": 0.9},
+    ],
+)
+def test_the_cars_model_is_the_emulators_plant_driven_in_small_steps(direction, speed_mps, changes):
+    car = corner(**changes)
+    system = model.car(car, speed_mps, direction)
+    small = PlantInSmallSteps(car, direction * speed_mps)
     rng = random.Random(3)
     state = np.zeros((len(system.a), 1))
-    for _ in range(200):
-        assert (system.c @ state)[:, 0] == pytest.approx([road.e_m, road.heading_rad], rel=3e-3, abs=2e-8)
-        curvature = rng.uniform(-1e-3, 1e-3)
-        road.drive(math.atan(WHEELBASE_M * curvature))
-        state = system.a @ state + system.b * curvature
-    assert abs(road.e_m) > 1e-5
+    largest = np.zeros(4)
+    command = 0.0
+    for cycle in range(300):
+        found, expected = (system.c @ state)[:, 0], np.array(small.reports())
+        largest = np.maximum(largest, np.abs(expected))
+        assert found == pytest.approx(expected, abs=0.03 * np.max(largest) + 1e-9), cycle
+        assert np.all(np.abs(found - expected) <= 0.03 * largest + 1e-9), cycle
+        if cycle % 10 == 0:
+            command = rng.choice((-1e-4, 1e-4))
+        small.drive(command)
+        state = system.a @ state + system.b * command
+    assert np.all(largest > 1e-8)
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize("law", design.LAWS)
-@pytest.mark.parametrize("nominal", [model.Nominal(0.1, 2), model.Nominal(0.0, 0), model.Nominal(0.27, 25)])
-def test_the_controllers_model_answers_as_the_firmware_does(direction, law, nominal):
-    predicts = law in design.PREDICTING_LAWS
+@pytest.mark.parametrize(("law", "mode"), RUNS)
+@pytest.mark.parametrize("nominal", [NOMINAL, model.Nominal(2.8, 0.0, 0, 0), model.Nominal(4.0, 0.27, 3, 24)])
+def test_the_controllers_model_answers_as_the_firmware_does(direction, law, mode, nominal):
     row = row_at(designed()[law], direction, 0.6)
-    system = model.controller(row, nominal, predicts)
-    firmware = FirmwareLaw(row, nominal, predicts)
+    system = model.controller(row, nominal, mode)
+    firmware = FirmwareLaw(row, nominal, mode)
     rng = random.Random(4)
     state = np.zeros((len(system.a), 1))
     largest = 0.0
-    for _ in range(300):
-        pose = np.array([[rng.uniform(-1e-4, 1e-4)], [rng.uniform(-1e-5, 1e-5)]])
-        wanted = (system.c @ state + system.d @ pose).item()
-        given = math.tan(firmware.command_rad(*pose[:, 0])) / WHEELBASE_M
-        assert given == pytest.approx(wanted, rel=1e-4, abs=1e-9)
-        state = system.a @ state + system.b @ pose
+    for _ in range(200):
+        report = np.array([[rng.uniform(-w, w)] for w in (1e-4, 1e-5, 1e-5, 1e-5)])
+        wanted = (system.c @ state + system.d @ report).item()
+        given = firmware.command_rad(*report[:, 0])
+        assert given == pytest.approx(wanted, rel=1e-3, abs=1e-8)
+        state = system.a @ state + system.b @ report
         largest = max(largest, abs(wanted))
     assert largest > 1e-5
 
 
-@pytest.mark.parametrize("law", design.LAWS)
-@pytest.mark.parametrize("nominal", [model.Nominal(0.1, 2), model.Nominal(0.0, 0)])
-def test_frequency_responses_are_those_of_the_matrices(law, nominal):
-    predicts = law in design.PREDICTING_LAWS
+@pytest.mark.parametrize(("law", "mode"), RUNS)
+def test_frequency_responses_are_those_of_the_matrices(law, mode):
     z = design.on_circle(design.frequencies(0.5, 25))
     row = row_at(designed()[law], -1.0, 0.5)
-
-    def response(system):
-        return np.array([(system.c @ np.linalg.solve(s * np.eye(len(system.a)) - system.a, system.b)) for s in z])
-
-    for corner in (model.Corner("", 0.1, 2.35, 1.1), model.Corner("", 0.0, 0.0, 1.0), model.Corner("", 0.2, 3.0, 0.9)):
-        loop = model.loop_response(row, nominal, [corner], z, predicts)[0]
-        assert loop == pytest.approx(response(model.open_loop(row, nominal, corner, predicts))[:, 0, 0], rel=1e-5)
-
-
-def test_in_reverse_the_loop_is_the_same_loop():
-    nominal, corner = model.Nominal(0.1, 2), model.Corner("", 0.2, 3.0, 1.1)
-    forward, reverse = (
-        np.sort_complex(
-            model.poles_1pm(model.closed_loop(row_at(designed()["car"], d, 0.8), nominal, corner), 0.8).round(3)
-        )[-6:]
-        for d in DIRECTIONS
-    )
-    assert forward == pytest.approx(reverse)
-    mixed = row_at(designed()["car"], 1.0, 0.8)._replace(direction=-1.0)
-    assert not model.is_stable(model.closed_loop(mixed, nominal, corner)), "forward's gains belong to forward"
+    system = model.controller(row, NOMINAL, mode)
+    for car in (corner(), corner(steering_lag_s=0.0, pose_latency_samples=0, command_latency_samples=0.0)):
+        own = model.car(car, 0.5, -1.0)
+        assert model.car_response(car, 0.5, -1.0, z) == pytest.approx(model.response(own, z)[:, :, 0], rel=1e-6)
+        loop = model.loop_response(system, row, [car], z)[0]
+        assert loop == pytest.approx(model.response(model.open_loop(system, own), z)[:, 0, 0], rel=1e-5)
 
 
-# The observer
+def test_forwards_gains_belong_to_forward():
+    car = corner(steering_lag_s=0.2)
+    right = row_at(designed()["car"], 1.0, 0.8)
+    mixed = right._replace(direction=-1.0)
+    assert model.is_stable(model.closed_loop(model.controller(right, NOMINAL), model.car(car, 0.8, 1.0)))
+    assert not model.is_stable(model.closed_loop(model.controller(mixed, NOMINAL), model.car(car, 0.8, -1.0)))
 
 
-def riccati_recursion(direction, speed_mps, noise, cycles):
+# The estimator
+
+
+def riccati_recursion(f, q, cycles):
     """Kalman gains after so many cycles from a wide start, by the textbook's recursion."""
-    f, h, q, r = design.observer_model(direction, speed_mps, noise)
+    h, r = design.POSE, design.POSE_NOISE
     covariance = np.diag([1.0, 0.1, 0.01])
     gain = np.zeros((3, 2))
     for _ in range(cycles):
@@ -138,26 +150,40 @@ def riccati_recursion(direction, speed_mps, noise, cycles):
     return gain
 
 
-@pytest.mark.parametrize(("direction", "speed_mps"), [(1.0, 1.0), (-1.0, 1.0), (1.0, 0.1), (-1.0, 0.035)])
+@pytest.mark.parametrize(("direction", "speed_mps"), [(1.0, 1.0), (-1.0, 1.0), (-1.0, 0.2)])
 def test_kalman_gains_are_what_the_riccati_recursion_settles_at(direction, speed_mps):
-    noise = design.observer_noise(design.OBSERVER_PACES[0])
-    recursion = riccati_recursion(direction, speed_mps, noise, 12000)
-    solved = design.observer_gains(direction, speed_mps, noise)
-    assert solved == pytest.approx(recursion, rel=1e-5, abs=1e-9)
-    assert np.abs(solved).max() > 0.01
+    noise = design.observer_noise(0.5)
+    for solved, (f, q) in (
+        (design.gyro_gains(direction, speed_mps), design.gyro_model(direction, speed_mps)),
+        (design.steering_gains(direction, speed_mps, noise), design.steering_model(direction, speed_mps, noise)),
+    ):
+        recursion = riccati_recursion(f, q, 25_000)
+        assert solved == pytest.approx(recursion, rel=1e-4, abs=1e-9)
+        assert np.abs(solved).max() > 1e-3
 
 
-def test_the_tables_hold_the_observer_and_nothing_at_standstill():
+def test_the_road_gain_is_what_its_recursion_settles_at():
+    ds = 0.5 * model.PERIOD_S
+    noise = (design.YAW_RATE_NOISE_RADPS * model.PERIOD_S) ** 2
+    variance = 1.0
+    for _ in range(5000):
+        gain = variance * ds / (variance * ds * ds + noise)
+        variance = (1.0 - gain * ds) * variance + design.ROAD_WALK_1PM**2 * ds
+    assert design.road_gain(1.0, 0.5) == pytest.approx(gain, rel=1e-9)
+    assert design.road_gain(-1.0, 0.5) == -design.road_gain(1.0, 0.5)
+
+
+def test_the_tables_hold_the_estimator_and_nothing_at_standstill():
     for direction in DIRECTIONS:
         for row in rows_of(designed()["car"], direction):
             if row.speed_mps == 0.0:
-                assert row[6:] == (0.0,) * 6
+                assert row[6:] == (0.0,) * (len(row) - 6)
             else:
-                expected = design.observer_gains(
-                    direction, row.speed_mps, design.observer_noise(design.OBSERVER_PACES[0])
-                )
-                assert row[6:] == pytest.approx(tuple(expected.reshape(-1)))
-        assert all(row[6:] == (1.0, 0.0, 0.0, 1.0, 0.0, 0.0) for row in rows_of(designed()["pid_ff"], direction))
+                expected = design.gyro_gains(direction, row.speed_mps)
+                assert row[7:13] == pytest.approx(tuple(expected.reshape(-1)))
+                assert row.l_dr == design.road_gain(direction, row.speed_mps)
+        for row in rows_of(designed()["pid_ff"], direction):
+            assert row[6:] == (0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 
 
 # The tables
@@ -174,11 +200,13 @@ def test_tables_have_the_firmwares_form():
     assert 14 <= len(design.SPEED_GRID_MPS) <= 20
 
 
-def test_in_reverse_only_the_observers_cross_terms_change_their_sign():
+def test_in_reverse_only_the_estimators_cross_terms_change_their_sign():
+    signs = dict.fromkeys(design.COLUMNS, 1.0)
+    signs |= dict.fromkeys(("direction", "l_ep", "l_pe", "l_be", "l_dr", "m_ep", "m_pe", "m_dp"), -1.0)
     for table in designed().values():
         for ahead, back in zip(rows_of(table, 1.0), rows_of(table, -1.0), strict=True):
-            signs = (-1, 1, 1, 1, 1, 1, 1, -1, -1, 1, 1, -1)
-            assert back == pytest.approx(tuple(s * v for s, v in zip(signs, ahead, strict=True)), rel=1e-6, abs=1e-12)
+            mirrored = tuple(sign * value for sign, value in zip(signs.values(), ahead, strict=True))
+            assert back == pytest.approx(mirrored, rel=1e-6, abs=1e-12)
 
 
 @pytest.mark.parametrize("law", design.LAWS)
@@ -186,23 +214,24 @@ def test_in_reverse_only_the_observers_cross_terms_change_their_sign():
 def test_gains_are_smooth_over_speed(law, direction):
     rows = rows_of(designed("paper", "slow-rack")[law], direction)
     for low, high in pairwise(rows[1:]):
-        for name in ("kp", "ki", "kd", "l_ee", "l_ep", "l_pe", "l_pp", "l_de", "l_dp"):
+        for name in design.COLUMNS[3:]:
             a, b = getattr(low, name), getattr(high, name)
-            assert abs(b - a) <= 0.62 * max(abs(a), abs(b)), (name, low.speed_mps)
+            assert abs(b - a) <= 0.62 * max(abs(a), abs(b)) + 1e-6, (name, low.speed_mps)
 
 
 @pytest.mark.parametrize("direction", [0, 1])
-def test_between_two_rows_the_firmware_has_nearly_the_observer_of_that_speed(direction):
+def test_between_two_rows_the_firmware_has_nearly_the_estimator_of_that_speed(direction):
     table = designed()["car"]
     grid = design.SPEED_GRID_MPS
     gain = tuple(tuple(tuple(row[2:]) for row in rows_of(table, d)) for d in DIRECTIONS)
     firmware = GainTable(grid, len(grid) - 1, gain)
+    assert (5, 12, len(design.COLUMNS) - 2) == (L_EE, M_EE, GAIN_COLUMNS)
     for low, high in pairwise(grid[1:]):
         speed = 0.5 * (low + high)
-        exact = design.observer_gains(
-            DIRECTIONS[direction], speed, design.observer_noise(design.OBSERVER_PACES[0])
-        ).reshape(-1)
-        assert np.array(gains_at(firmware, direction, speed)[4:]) == pytest.approx(exact, rel=0.05)
+        found = gains_at(firmware, direction, speed, 1)
+        exact = design.gyro_gains(DIRECTIONS[direction], speed)
+        assert np.array(found[5:11]) == pytest.approx(exact.reshape(-1), rel=0.05, abs=1e-7)
+        assert found.dr == pytest.approx(design.road_gain(DIRECTIONS[direction], speed), rel=0.05)
 
 
 # The choice
@@ -210,7 +239,7 @@ def test_between_two_rows_the_firmware_has_nearly_the_observer_of_that_speed(dir
 
 def test_the_choice_is_the_fastest_that_keeps_the_margin_and_the_next_faster_does_not():
     vehicle = vehicle_of("paper", "slow-rack")
-    nominal, cars = model.nominal_of(vehicle), design.corners(vehicle)
+    nominal, cars = model.nominal_of(vehicle), design.corners(vehicle, softest_tyres=True)
     row = row_at(designed("paper", "slow-rack")["car"], 1.0, 1.0)
     pace = row.kd / 2.5
     assert design.SLOWEST_PACE < pace < design.FASTEST_PACE["car"], "the margins decide here, not the ends"
@@ -218,34 +247,21 @@ def test_the_choice_is_the_fastest_that_keeps_the_margin_and_the_next_faster_doe
 
     def least(pace):
         kp, ki, kd = design.pid_gains(pace)
-        return design.disk_margin(model.loop_response(row._replace(kp=kp, ki=ki, kd=kd), nominal, cars, z)).min()
+        faster = row._replace(kp=kp, ki=ki, kd=kd)
+        return design.disk_margin(model.loop_response(model.controller(faster, nominal), faster, cars, z)).min()
 
-    assert least(pace) >= design.LEAST_DISK_MARGIN > least(1.02 * pace)
-
-
-@pytest.mark.parametrize("scenario", [None, "ideal", "slow-rack"])
-def test_every_overlay_has_gains_that_hold_in_its_whole_box(scenario):
-    vehicle = vehicle_of("paper", scenario)
-    nominal, cars = model.nominal_of(vehicle), design.corners(vehicle)
-    for law, table in designed("paper", scenario).items():
-        for row in (row for row in map(model.Row._make, table) if row.speed_mps in (0.05, 0.5, 1.0)):
-            for car in cars:
-                matrix = model.closed_loop(row, nominal, car, law in design.PREDICTING_LAWS)
-                assert design.d_stable(matrix, row.speed_mps), (law, row.direction, row.speed_mps, car.name)
+    assert least(pace) >= design.LEAST_DISK_MARGIN["car"] > least(1.03 * pace)
 
 
 def test_a_wider_box_gives_softer_gains_at_speed():
     known = row_at(designed()["car"], 1.0, 1.0)
     slow = row_at(designed("paper", "slow-rack")["car"], 1.0, 1.0)
-    assert slow.kp < 0.5 * known.kp
-    assert slow.kd < 0.7 * known.kd
+    assert slow.kp < 0.7 * known.kp
+    assert slow.kd < 0.85 * known.kd
 
 
-def test_the_design_is_the_same_when_made_again_and_for_another_wheelbase():
-    again = design.design_gains(vehicle_of())
-    assert again == designed()
-    short = design.design_gains(vehicle_of("fusion"))
-    assert short == designed(), "gains are for curvature; these two cars have the same steering chain"
+def test_the_design_is_the_same_when_made_again():
+    assert design.design_gains(vehicle_of()) == designed()
 
 
 def test_a_slower_car_is_checked_only_at_the_speeds_it_has():
@@ -261,7 +277,7 @@ def test_a_slower_car_is_checked_only_at_the_speeds_it_has():
     [
         ({"steering_lag_s": 2.0}, "steering_lag_s"),
         ({"wheelbase_m": 12.0}, "wheelbase_m"),
-        ({"command_latency_samples": 60.0}, "pose_latency_samples + command_latency_samples"),
+        ({"command_latency_samples": 60.0}, "command_latency_samples"),
     ],
 )
 def test_a_car_that_no_gains_can_hold_is_refused_in_one_line_that_names_the_dimension(overlay, named):
