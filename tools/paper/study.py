@@ -10,7 +10,8 @@ from sim.body import Outline, clearance_array_m, outline_of
 from sim.data_files import Course, Vehicle
 from tools.design.path import Path
 from tools.design.waypoints import Floats
-from tools.paper import path_study, rear_axle
+from tools.paper import firmware_law, path_study, rear_axle
+from tools.paper.firmware_law import FirmwareRun
 from tools.paper.fit import StoredFit
 from tools.paper.laws import BOTH, LAWS, Gains, Law
 from tools.paper.path_study import AS_PRINTED, VARIANTS, Choice, PathResult
@@ -76,6 +77,7 @@ class Study(NamedTuple):
     rear_runs: dict[str, RearAxleRun]
     rates: Rates
     convergence: dict[float, Figures]
+    firmware: list[FirmwareRun]
 
 
 def gains_for(car: PaperCar, stored: StoredFit) -> Gains:
@@ -118,7 +120,7 @@ def compute(vehicle: Vehicle, course: Course, stored: StoredFit, tell: Callable[
         vehicle, course, car, outline, stored, gains, TABLE_3, paths,
         path_study.sweep(stored.waypoints, VARIANTS[0]), path_study.sweep(stored.waypoints, VARIANTS[-1]),
         tracks, motions, results, leaving, room_m, rear_path, rear_runs, study_rates(car, gains, paths),
-        convergence(car, gains, tracks[FORWARD]),
+        convergence(car, gains, tracks[FORWARD]), firmware_law.study(car, gains, tracks),
     )  # fmt: skip
 
 

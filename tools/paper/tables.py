@@ -1,5 +1,6 @@
 """The paper's tables with ours beside it, for people, for machines, and what must hold of them."""
 
+from math import isinf
 from typing import Any, NamedTuple
 
 from tools.paper.laws import BOTH, DOB, LAWS, PID, TABLE_4_OBSERVER
@@ -121,6 +122,16 @@ def as_json(study: Study) -> dict[str, Any]:
             "runs": [row._asdict() for row in study.rates.runs],
             "step_that_gives_the_printed_rate_s": study.rates.printed_step_s,
         },
+        "firmware_law": [
+            {
+                "law": run.law,
+                "direction": run.direction,
+                "bus": run.bus,
+                **{field: None if isinf(getattr(run, field)) else getattr(run, field) for field in JUDGED},
+                "travelled_m": run.travelled_m,
+            }
+            for run in study.firmware
+        ],
         "checks": [check._asdict() for check in checks(study)],
     }
 
