@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.data_files import SIDES, load_scenario, load_vehicle
+from sim.data_files import FOLDERS, SIDES, load_scenario, load_vehicle
 from sim.errors import UserError
-from tools.campaign.draws import DRAWN_FROM_BOX, draw, drawn_names
+from tools.campaign.draws import DRAWN_FROM_BOX, TABLE, draw, drawn_names, text_of_table
 from tools.campaign.journal import HEAD, Journal, journal_of
 from tools.campaign.parquet import read_rows, write_rows
 from tools.campaign.results import COLUMNS, Rows, summarise, worst_first
@@ -159,6 +159,13 @@ def test_what_the_scenario_decides_is_left_to_it() -> None:
     starts = [draw(load_vehicle("paper"), offset, seed).scenario.start.aside_m[0] for seed in range(100)]
     assert max(starts) > 0.03
     assert set(drawn) <= set(DRAWN_FROM_BOX)
+
+
+def test_the_table_of_draws_stands_in_the_help_and_in_the_scenarios_text() -> None:
+    text = (FOLDERS["scenario"] / "README.md").read_text()
+    for part, what, how in TABLE:
+        assert f"| {part} | {what} | {how} |" in text
+        assert how in " ".join(text_of_table().split())
 
 
 def test_chunks_do_not_depend_on_who_drives_them() -> None:

@@ -7,6 +7,7 @@ the emulator drive the same run from it. Sides alternate with the seed: even lef
 from __future__ import annotations
 
 import random
+import textwrap
 from typing import NamedTuple
 
 from sim.data_files import SIDES, PlantDeviation, Scenario, Side, StartOffset, Vehicle
@@ -61,7 +62,11 @@ class Drawn(NamedTuple):
 
 def text_of_table() -> str:
     """Return the table as lines for people."""
-    return "\n".join(f"  {part:<8} {what}{': ' if what else ''}{how}" for part, what, how in TABLE)
+    lines = []
+    for part, what, how in TABLE:
+        text = f"{what}: {how}" if what else how
+        lines += textwrap.wrap(text, 100, initial_indent=f"  {part:<8} ", subsequent_indent=" " * 13)
+    return "\n".join(lines)
 
 
 def drawn_names(vehicle: Vehicle, scenario: Scenario) -> tuple[str, ...]:
