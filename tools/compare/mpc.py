@@ -23,9 +23,9 @@ from tools.compare.laws import MPC_ARGUMENTS
 
 Floats = npt.NDArray[np.float64]
 
-STEPS = 25
-STEP_S = 0.05
-"""Horizon: 1.25 s, a dozen lags; the terminal cost stands for the rest."""
+STEPS = 15
+STEP_S = 0.08
+"""Horizon: 1.2 s, a dozen lags; the terminal cost stands for the rest."""
 
 SPEED_STEP_MPS = 0.05
 """Speeds are rounded to this for the model's matrices, so that each is made and factorised once."""
