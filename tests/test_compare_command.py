@@ -1,0 +1,152 @@
+"""`parkctl compare` as a user runs it, and the firmware in it against the firmware in lock-step."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from campaign_support import TABLES
+from compare_support import driver, numbers_of
+
+from sim.data_files import load_course, load_scenario, load_vehicle
+from tools import cli
+from tools.compare import command
+from tools.compare.runs import CONTROLLERS, LegFigures, RunFigures, side_of
+from tools.figures import leg_figures, load_path, split_legs, truth_of_rows
+from tools.lockstep import run_lockstep
+
+FIELDS = {
+    "controller", "inputs", "scenario", "vehicle", "direction", "seeds", "max_cross_track_m", "p95_cross_track_m",
+    "rms_cross_track_m", "final_cross_track_m", "final_heading_error_rad", "min_clearance_m", "command_jitter_rad",
+    "tick_us", "stopped_runs",
+}  # fmt: skip
+SEED = 2_000_008  # driven on the right side
+
+
+def test_the_shipped_law_is_the_firmware_as_it_runs_in_lock_step() -> None:
+    ours = driver().run(CONTROLLERS["car"].law, (), "raw", SEED)
+    side = side_of(SEED)
+    assert side == "right"
+    run = run_lockstep(load_vehicle("paper"), load_course("ohio"), load_scenario("car"), side, SEED, "car", TABLES)
+    truth, path = truth_of_rows(run.truth), load_path(TABLES, side)
+    theirs = [leg_figures(leg, truth, path) for leg in split_legs(truth, path, None)]
+    assert ours.completed
+    assert len(theirs) == 2
+    for leg, told in zip(ours.legs, theirs, strict=True):
+        assert leg.max_cross_track_m == pytest.approx(told["max_cross_track_m"], abs=1e-9)
+        assert leg.final_cross_track_m == pytest.approx(told["final_cross_track_m"], abs=1e-9)
+        assert leg.min_clearance_m == pytest.approx(told["min_clearance_m"], abs=1e-9)
+        assert (leg.sum_of_squares_m2 / leg.samples) ** 0.5 == pytest.approx(told["rms_cross_track_m"], abs=1e-6)
+
+
+@pytest.mark.parametrize("inputs", ["raw", "estimator"])
+@pytest.mark.parametrize("name", ["pure-pursuit", "lqr-preview", "mpc", "dob+pid"])
+def test_another_law_drives_both_legs_and_is_repeatable(name: str, inputs: str) -> None:
+    law, numbers = CONTROLLERS[name].law, numbers_of(name, inputs)
+    first = driver().run(law, numbers, inputs, SEED)
+    shipped = driver().run(CONTROLLERS["car"].law, (), inputs, SEED)
+    assert first.completed
+    assert all(0.0 < leg.max_cross_track_m < 0.1 and leg.samples > 1000 for leg in first.legs)
+    assert first.legs != shipped.legs
+    if name != "mpc":
+        assert driver().run(law, numbers, inputs, SEED) == first
+
+
+def test_a_law_that_goes_far_off_is_driven_to_the_end() -> None:
+    beyond = driver().run(CONTROLLERS["ff"].law, (0.1,), "raw", 3)
+    assert beyond.completed
+    assert max(leg.max_cross_track_m for leg in beyond.legs) > 0.2  # where the firmware alone would have stopped
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    driver()
+    folder = tmp_path_factory.mktemp("compare")
+    options = ["--scenario", "car", "--controller", "car", "--controller", "pid+ff", "--seeds", "5", "--jobs"]
+    files = []
+    for jobs in (1, 2):
+        file, picture = folder / f"{jobs}.json", folder / f"{jobs}.png"
+        assert cli.main(["compare", *options, str(jobs), "--json", str(file), "--plot", str(picture)]) == 0
+        files.append(json.loads(file.read_text()))
+    for rows in (files[0]["rows"], files[1]["rows"]):
+        for row in rows:
+            assert row.pop("tick_us") > 0.0
+    assert files[0]["rows"] == files[1]["rows"]
+    return files[0], picture
+
+
+def test_rows_have_the_agreed_fields(told: tuple[dict[str, Any], Path]) -> None:
+    rows = told[0]["rows"]
+    assert len(rows) == 2 * 2 * 2
+    assert all(set(row) | {"tick_us"} == FIELDS for row in rows)
+    assert {(row["controller"], row["inputs"], row["direction"]) for row in rows} == {
+        (name, inputs, direction)
+        for name in ("car", "pid+ff")
+        for inputs in ("raw", "estimator")
+        for direction in ("forward", "reverse")
+    }
+    for row in rows:
+        assert (row["scenario"], row["vehicle"], row["seeds"], row["stopped_runs"]) == ("car", "paper", 5, 0)
+        assert row["rms_cross_track_m"] < row["p95_cross_track_m"] <= row["max_cross_track_m"]
+        assert row["final_cross_track_m"] <= row["max_cross_track_m"]
+        assert 0.2 < row["min_clearance_m"] < 0.4
+    shipped = [{k: v for k, v in row.items() if k != "inputs"} for row in rows if row["controller"] == "car"]
+    assert shipped[:2] == shipped[2:]  # it brings its estimator along
+
+
+def test_the_shipped_law_has_at_most_half_the_error_of_pid_ff_on_raw_inputs(told: tuple[dict[str, Any], Path]) -> None:
+    claims = {claim["claim"]: claim for claim in told[0]["claims"]}
+    raw = claims["car: at most half of the best other on raw inputs"]
+    assert raw["best_other"] == "pid+ff"
+    assert raw["holds"]
+    assert raw["car_m"] <= 0.5 * raw["best_other_m"]
+
+
+def test_the_picture_is_one(told: tuple[dict[str, Any], Path]) -> None:
+    assert told[1].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_a_claim_that_does_not_hold_is_said_not_to() -> None:
+    def runs(error_m: float) -> list[RunFigures]:
+        leg = LegFigures(error_m, error_m**2, 1.0, 0.0, 0.0, 0.3, 0.0)
+        return [RunFigures((leg, leg), True)]
+
+    judged = command.verdicts(
+        {
+            ("car", "car", "raw"): runs(0.003),
+            ("car", "lqr", "raw"): runs(0.005),
+            ("car", "mpc", "raw"): runs(0.009),
+            ("car-unknown-lag", "car", "raw"): runs(0.003),
+            ("car-unknown-lag", "lqr", "raw"): runs(0.004),
+        }
+    )
+    assert [(verdict.best_other, verdict.holds) for verdict in judged] == [("lqr", False), ("lqr", True)]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--controller", "lqg"], "--controller lqg: there is no such one; there are ff, pure-pursuit"),
+        (["--scenario", "carr"], "carr"),
+        (["--seeds", "0"], "--seeds 0: must be from 1 to 10000"),
+        (["--seeds", "many"], "--seeds"),
+        (["--seed", "5"], "--seed 5: must be at least 1000"),
+        (["--jobs", "0"], "--jobs 0: must be from 1 to 256"),
+        (["--inputs", "cooked"], "--inputs"),
+        (["--vehicle", "tank"], "tank"),
+        (["--tunings", "none.json"], "--tunings none.json: cannot be read"),
+        (["--json", "no/such/x.json"], "there is no folder no/such"),
+        (["--plot", "x.pdf"], "--plot x.pdf: name a file that ends in .png"),
+    ],
+)
+def test_a_mistake_gives_one_clear_line(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["compare", "--scenario", "car", *options]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
