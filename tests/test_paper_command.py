@@ -110,6 +110,8 @@ def test_the_whole_command_for_another_car(
                 assert cell["paper"] is None
                 assert isinstance(cell["ours"], float)
     assert content["table4"]["M_kg"]["paper"] is None
+    assert content["steering_rates"]["step_that_gives_the_printed_rate_s"] == {"forward": None, "reverse": None}
+    assert len(content["firmware_law"]) == 18
     assert content["table1"]["m"] == {"paper": 4, "ours": 4}
     assert all(content["rear_axle_law"][way]["max_cross_track_m"] <= 1e-3 for way in ("forward", "reverse"))
     page = (out / "index.html").read_text()

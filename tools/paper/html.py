@@ -67,13 +67,13 @@ def equation(text: str) -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool = False) -> str:
-    """A table; cells are HTML, a cell that begins with "!" is marked bad, with "+" good; words stand to the left."""
+    """A table; cells are HTML, a cell that begins with "!" is marked bad, with "~" good; words stand to the left."""
     columns = "".join(f"<th>{cell}</th>" for cell in head)
     lines = []
     for row in rows:
         cells = []
         for cell in row:
-            mark = {"!": ' class="bad"', "+": ' class="good"'}.get(cell[:1], "")
+            mark = {"!": ' class="bad"', "~": ' class="good"'}.get(cell[:1], "")
             cells.append(f"<td{mark}>{cell[1:] if mark else cell}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
     kind = ' class="words"' if words else ""

@@ -218,7 +218,7 @@ def parameter_space(study: Study, loops: Loops, picture: Picture) -> str:
                 case.region.text().replace("<=", "&le;").replace(">=", "&ge;"),
                 f"{least.x:.2f}, {least.y:.2f}",
                 f"{fitted.x:.1f}, {fitted.y:.1f}",
-                "+yes" if fitted.inside else "!no",
+                "~yes" if fitted.inside else "!no",
             )
         )
         for point, name in ((least, "least gains"), (fitted, "fitted gains")):
@@ -271,7 +271,7 @@ def parameter_space(study: Study, loops: Loops, picture: Picture) -> str:
             ),
             note(
                 WRONG,
-                "&ldquo;As small as possible&rdquo; gives gains twenty times smaller than Tables 5 and 6 "
+                "&ldquo;As small as possible&rdquo; gives gains less than a tenth of what Tables 5 and 6 "
                 "need. And a region with a fixed shift in rad/s is empty at low "
                 "speed: the slow zero at V/(l<sub>r</sub> + l<sub>s</sub>), 0.05 rad/s at 0.1 m/s, draws "
                 "a pole to itself.",
@@ -279,7 +279,7 @@ def parameter_space(study: Study, loops: Loops, picture: Picture) -> str:
             note(
                 SO,
                 "Design per metre of travel: shift, radius and gains scale with the speed, and one row of "
-                "gains serves all speeds. A PID with k<sub>p</sub> near 64 rad/m is "
+                f"gains serves all speeds. A PID with k<sub>p</sub> = {gains.kp:.0f} rad/m is "
                 "not what smooths the DOB, as the text has it; it is a high-gain loop of its own.",
             ),
         ]

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 from tools.paper.html import OURS, SAYS, SO, WRONG, equation, note, number, p, table
+from tools.paper.laws import DOB
 from tools.paper.path_study import AS_PRINTED, CORRECTED
 from tools.paper.plant import CORRECTED as CORRECTED_SIGN
 from tools.paper.plant import FORWARD, PRINTED, REVERSE, Plant, zeros_and_poles
 from tools.paper.printed import START_REVERSE
-from tools.paper.study import Study
+from tools.paper.study import TABLE_5, Study
 
 Picture = Callable[[str, str], str]
 
@@ -33,6 +34,7 @@ def path(study: Study, content: dict[str, Any], picture: Picture) -> str:
     ]
     printed, fixed = figures[AS_PRINTED], figures[CORRECTED]
     x_end = START_REVERSE[0]
+    clearance = study.results[TABLE_5][DOB].min_clearance_m
     best = min((c for c in study.choices if c.m == 4 and c.q == 3), key=lambda c: c.rms_curvature_1pm)
     six = next(c for c in study.choices if (c.m, c.p, c.q) == (4, 6, 3))
     even = sorted((c for c in study.choices if c.m == 4 and c.q == 3), key=lambda c: c.p)
@@ -153,9 +155,9 @@ def path(study: Study, content: dict[str, Any], picture: Picture) -> str:
             ),
             note(
                 WRONG,
-                "The paper never draws the body. Not every detail of its path can be known from its "
-                "tables, but every path that fits them "
-                "is so late and so short a lane change that a body of this size runs over the point cone.",
+                "The paper never draws the body. Not every detail of its path can be known from its tables; on this "
+                f"reconstruction the least clearance to a cone is {clearance:.2f} m forward (a cone counts as touched "
+                f"within {study.course.cone_radius_m:.2f} m of its axis, below zero the body stands over it).",
             ),
         ]
     )
@@ -258,7 +260,7 @@ def speed(study: Study, content: dict[str, Any], picture: Picture) -> str:
     """Table 3."""
     rows = [(name, number(cell["paper"]), number(cell["ours"])) for name, cell in content["table3"].items()]
     plan = study.motions[FORWARD]
-    lateral = float((plan.speed_mps**2 * abs(study.results["table5"]["DOB"].run.curvature_1pm)).max()) / 9.80665
+    lateral = float((plan.speed_mps**2 * abs(study.results[TABLE_5][DOB].run.curvature_1pm)).max()) / 9.80665
     ramp = float(
         plan.time_s[(plan.speed_mps < 0.999 * plan.speed_mps.max()) & (plan.station_m < 0.5 * plan.station_m[-1])].max()
     )

@@ -60,15 +60,15 @@ def summary(study: Study, content: dict[str, Any], picture: Picture) -> str:
     rows = [
         (
             check["name"],
-            ("+" if check["holds"] else "!") + f"{check['value']:.3g}",
+            ("~" if check["holds"] else "!") + f"{check['value']:.3g}",
             check["limit"].replace("+-", "&plusmn;").replace(">=", "&ge;").replace("<=", "&le;"),
         )
         for check in checks
     ]
     claims = [
-        ("the path's curvature is smooth across the joints", "+yes", "to rounding, with q = 3"),
+        ("the path's curvature is smooth across the joints", "~yes", "to rounding, with q = 3"),
         ("p = 6 has the smallest rms curvature", "!no", "see the sweep: it trades curvature against misfit"),
-        ("PID + DOB is far better than either alone in e<sub>y</sub>", "+yes", f"{factor:.0f} times"),
+        ("PID + DOB is far better than either alone in e<sub>y</sub>", "~yes", f"{factor:.0f} times"),
         (
             "the tracking is accurate",
             "!no",
@@ -80,7 +80,7 @@ def summary(study: Study, content: dict[str, Any], picture: Picture) -> str:
             "it is a high-gain loop; its share of the steering is small because the error is",
         ),
         ("reverse is as good as forward", "!no", "only with the sign of eq. 11 as printed"),
-        ("gains as small as possible", "!no", "Tables 5 and 6 need about twenty times more"),
+        ("gains as small as possible", "!no", "Tables 5 and 6 need more than ten times as much"),
         ("steering rates of 2.4 to 3.2 rad/s", "!artefact", "of a path with free ends and of the simulation's step"),
     ]
     return "".join(

@@ -92,7 +92,8 @@ def study_rates(car: PaperCar, gains: Gains, paths: dict[str, PathResult]) -> Ra
             law: np.array([kick_radps(car, direction, Law(law, gains), track, step) for step in KICK_STEPS_S])
             for law in (DOB, PID, BOTH)
         }
-        printed_step[direction] = _step_for(TABLES_5_6[direction][PID].max_steer_rate_radps, kicks[direction][PID])
+        wanted = TABLES_5_6[direction][PID].max_steer_rate_radps
+        printed_step[direction] = _step_for(wanted, kicks[direction][PID]) if car.is_papers else None
     return Rates(runs, np.array(KICK_STEPS_S), kicks, printed_step)
 
 

@@ -68,7 +68,7 @@ def _dot(axes: Axes, at: Point) -> None:
 
 def figure_6(stem: Path) -> None:
     """The path-tracking scenario, with the point that the paper brings to the path and the one that it leaves aside."""
-    figure, axes = sheet(width=11.0, height=6.0)
+    figure, axes = sheet(width=11.0, height=5.0)
     s = np.linspace(-1.0, 9.5, 200)
     k = 0.045
     axes.plot(s, 0.5 * k * s**2, color=INK, lw=2.4)

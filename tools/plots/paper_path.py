@@ -33,8 +33,11 @@ def rear_axle_poses(study: Study, every: int = 20) -> tuple[Any, Any, Any]:
     """Rear-axle poses of a car whose centre of gravity rides exactly on the path, without side slip."""
     path = study.paths[CORRECTED].path  # free ends would turn the standing body
     behind = study.vehicle.cg_to_rear_axle_m
-    # The front-wheel-steered car points where its rear axle comes from: heading from eq. 11's geometry, slip lr * rho.
-    yaw = path.yaw_rad - np.arcsin(np.clip(behind * path.curvature_1pm, -0.9, 0.9))
+    # The rear wheels do not slip sideways: the heading follows the way of the centre of gravity like a trailer.
+    yaw = np.zeros_like(path.yaw_rad)
+    yaw[0] = path.yaw_rad[0]
+    for k, course_rad in enumerate(path.yaw_rad[:-1]):
+        yaw[k + 1] = yaw[k] + path.step_m * np.sin(course_rad - yaw[k]) / behind
     x, y = path.x_m - behind * np.cos(yaw), path.y_m - behind * np.sin(yaw)
     return x[::every], y[::every], yaw[::every]
 
@@ -221,11 +224,11 @@ def rear_axle(study: Study, stem: Path) -> None:
     for one, (poses, colour, title) in zip(
         axes,
         (
-            ((x, y, yaw), RED, "centre of gravity on the reconstructed path: the body runs over the point cone"),
+            ((x, y, yaw), RED, "centre of gravity on the reconstructed path"),
             (
                 (study.rear_path.x_m, study.rear_path.y_m, study.rear_path.yaw_rad),
                 GREEN,
-                "rear axle on a path of its own: free of all cones",
+                "rear axle on a path of its own",
             ),
         ),
         strict=True,

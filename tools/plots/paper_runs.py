@@ -224,8 +224,9 @@ def rates(study: Study, stem: Path) -> None:
                 label=law,
             )
         printed = TABLES_5_6[direction][PID].max_steer_rate_radps
-        one.axhline(printed, color=RED, lw=1.0, ls="--")
-        one.text(4.0, printed * 1.08, f"printed for the PID: {printed:.2f} rad/s", color=RED, fontsize=9.5, ha="right")
+        if study.car.is_papers:
+            one.axhline(printed, color=RED, lw=1.0, ls="--")
+            one.text(4.0, printed * 1.08, f"printed: {printed:.2f} rad/s", color=RED, fontsize=9.5, ha="right")
         step = study.rates.printed_step_s[direction]
         if step is not None:
             one.plot(1e3 * step, printed, "o", color=RED, ms=8)
