@@ -131,6 +131,7 @@ def cache_folder(names: tuple[str, ...], *more: str) -> Path | None:
     digest = hashlib.sha256(f"{sys.version} numba {numba.__version__} numpy {np.__version__}".encode())
     for name in (*names, __name__):
         file = importlib.import_module(name).__file__
+        digest.update(str(file).encode())  # numba keeps apart what lies in different places
         digest.update(Path(str(file)).read_bytes())
     for text in more:
         digest.update(text.encode())

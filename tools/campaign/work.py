@@ -92,7 +92,7 @@ def drive_chunk(job: Job, runner: Runner, chunk: int) -> Rows:
 
 # -- processes of this machine ----------------------------------------------------------------------------------------
 
-_here: tuple[Job, Runner] | None = None
+_here: tuple[Job, Runner, str] | None = None
 
 
 def _begin_worker(job: Job) -> None:
@@ -101,7 +101,7 @@ def _begin_worker(job: Job) -> None:
     parent = parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-    _here = (job, Runner(job.shared))
+    _here = (job, Runner(job.shared), code_digest())
 
 
 def _end_with(sentinel: int) -> None:
@@ -110,9 +110,10 @@ def _end_with(sentinel: int) -> None:
     os._exit(1)
 
 
-def _drive_here(chunk: int) -> tuple[int, Rows]:
+def _drive_here(chunk: int) -> tuple[str, int, Rows]:
     assert _here is not None
-    return chunk, drive_chunk(*_here, chunk)
+    job, runner, code = _here
+    return code, chunk, drive_chunk(job, runner, chunk)
 
 
 def drive_on_this_machine(job: Job, chunks: list[int], workers: int) -> Iterator[tuple[int, Rows]]:
@@ -130,7 +131,10 @@ def drive_on_this_machine(job: Job, chunks: list[int], workers: int) -> Iterator
             done, running = _wait(running)
             for future in done:
                 running |= {pool.submit(_drive_here, chunk) for chunk in islice(waiting, 1)}
-                yield future.result()
+                code, chunk, rows = future.result()
+                if code != job.code:
+                    raise UserError("parkctl's own files have changed since the campaign was begun; begin it anew")
+                yield chunk, rows
     except BrokenProcessPool:
         raise UserError(
             "a worker process has ended before its time (out of memory?); what was finished is kept, --resume goes on"
@@ -139,7 +143,7 @@ def drive_on_this_machine(job: Job, chunks: list[int], workers: int) -> Iterator
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _wait(running: set[Future[tuple[int, Rows]]]) -> tuple[set[Any], set[Any]]:
+def _wait(running: set[Future[tuple[str, int, Rows]]]) -> tuple[set[Any], set[Any]]:
     from concurrent.futures import FIRST_COMPLETED, wait  # noqa: PLC0415
 
     done, rest = wait(running, return_when=FIRST_COMPLETED)
