@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tools import cli
-from tools.paper import figures, fit, loops, sampled_run
+from tools.paper import figures, fit, loops, rates, sampled_run, study
 from tools.paper.fit import STORED
 from tools.paper.laws import LAWS
 from tools.paper.sampled_run import SampledRun
@@ -87,12 +87,18 @@ def test_the_whole_command_for_another_car(
         none = np.zeros(0)
         return SampledRun(law.name, law.observer.bandwidth_radps, path, 1e-3, 5e-4, 0.4, none, none, none)  # type: ignore[attr-defined,arg-type]
 
-    def quick_pictures(folder: Path, study: object, found: object) -> list[str]:
-        names = list(figures.catalogue(study, found))  # type: ignore[arg-type]
+    def quick_pictures(folder: Path, results: object, found: object) -> list[str]:
+        names = list(figures.catalogue(results, found))  # type: ignore[arg-type]
         for name in names:
             (folder / f"{name}.svg").write_text(SVG)
         return names
 
+    for module in (
+        study,
+        rates,
+    ):  # four times the step: a quarter of the time, and figures that differ in the 4th digit
+        monkeypatch.setattr(module, "STEP_S", 4e-3)
+    monkeypatch.setattr(rates, "KICK_STEPS_S", (1e-4, 4e-3))
     monkeypatch.setattr(sampled_run, "run", quick_run)
     monkeypatch.setattr(loops, "highest_stable_bandwidth", lambda *_: 50.0)
     monkeypatch.setattr(figures, "draw_all", quick_pictures)
