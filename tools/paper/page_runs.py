@@ -236,8 +236,8 @@ def reverse(study: Study, content: dict[str, Any], picture: Picture) -> str:
             ),
             picture(
                 "divergence",
-                "Reverse with the corrected sign, same gains: all four laws leave the path before the car "
-                "has reached the point cone.",
+                "Reverse with the corrected sign, same gains: all four laws leave the path on the first "
+                "metres, while the steering runs away.",
             ),
             note(
                 WRONG,
