@@ -31,7 +31,7 @@ def write(folder: Path, study: Study, loops: Loops, content: dict[str, Any], tel
         ("path", "Path: eq. 1 to 10, Table 1, Figures 1 to 5", page_path.path(study, content, picture)),
         ("model", "Model: eq. 11, Table 2, Figure 6", page_path.model(study, content, picture)),
         ("speed", "Speed and preview: Table 3, Figure 7", page_path.speed(study, content, picture)),
-        ("dob", "Disturbance observer: eq. 12 to 18, Figures 8 to 10", page_loop.observer(loops, picture)),
+        ("dob", "Disturbance observer: eq. 12 to 18, Figures 8 to 10", page_loop.observer(study, loops, picture)),
         ("sampling", "The same loop at 100 Hz", page_loop.sampling(study, loops, picture)),
         ("pid", "Parameter space: eq. 19, Figures 11 to 13", page_loop.parameter_space(study, loops, picture)),
         ("runs", "Simulations: Tables 4 to 6, Figures 14 to 19", page_runs.simulations(study, content, picture)),

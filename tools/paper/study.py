@@ -13,7 +13,7 @@ from tools.design.waypoints import Floats
 from tools.paper import firmware_law, path_study, rear_axle
 from tools.paper.firmware_law import FirmwareRun
 from tools.paper.fit import StoredFit
-from tools.paper.laws import BOTH, LAWS, Gains, Law
+from tools.paper.laws import BOTH, DOB, LAWS, Gains, Law, Observer
 from tools.paper.path_study import AS_PRINTED, VARIANTS, Choice, PathResult
 from tools.paper.plant import CORRECTED as CORRECTED_SIGN
 from tools.paper.plant import FORWARD, PRINTED, REVERSE, TABLE_4, PaperCar, Plant, car_of
@@ -78,6 +78,7 @@ class Study(NamedTuple):
     rates: Rates
     convergence: dict[float, Figures]
     firmware: list[FirmwareRun]
+    observers: dict[Observer, Figures]
 
 
 def gains_for(car: PaperCar, stored: StoredFit) -> Gains:
@@ -121,6 +122,7 @@ def compute(vehicle: Vehicle, course: Course, stored: StoredFit, tell: Callable[
         path_study.sweep(stored.waypoints, VARIANTS[0]), path_study.sweep(stored.waypoints, VARIANTS[-1]),
         tracks, motions, results, leaving, room_m, rear_path, rear_runs, study_rates(car, gains, paths),
         convergence(car, gains, tracks[FORWARD]), firmware_law.study(car, gains, tracks),
+        observer_choices(car, gains, tracks[FORWARD]),
     )  # fmt: skip
 
 
@@ -131,6 +133,17 @@ def convergence(car: PaperCar, gains: Gains, track: Track) -> dict[float, Figure
         plan = motion(track.station_m, track.curvature_1pm, TABLE_3, step_s)
         found[step_s] = figures_of(simulate(Steps(Plant(car), Law(BOTH, gains), step_s), track, plan))
     return found
+
+
+def observer_choices(car: PaperCar, gains: Gains, track: Track) -> dict[Observer, Figures]:
+    """DOB alone, forward, with other bandwidths and other nominal factors than the paper's."""
+    plan = motion(track.station_m, track.curvature_1pm, TABLE_3, STEP_S)
+    choices = [Observer(bandwidth_radps=w) for w in (10.0, 30.0, 100.0, 300.0)]
+    choices += [Observer(nominal_factor=factor) for factor in (0.7, 1.0, 1.3)]
+    return {
+        choice: figures_of(simulate(Steps(Plant(car), Law(DOB, gains, choice), STEP_S), track, plan))
+        for choice in choices
+    }
 
 
 def drive(vehicle: Vehicle, course: Course, plant: Plant, law: Law, track: Track, plan: Motion) -> Result:
