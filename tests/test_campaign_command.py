@@ -53,6 +53,7 @@ def rows_of(file: Path) -> Any:
     return read_rows(file)[0]
 
 
+@pytest.mark.live
 def test_a_campaign_from_end_to_end(whole: tuple[Path, dict[str, Any], str]) -> None:
     file, figures, said = whole
     rows = rows_of(file)
@@ -69,6 +70,7 @@ def test_a_campaign_from_end_to_end(whole: tuple[Path, dict[str, Any], str]) -> 
     assert "cones touched 0" in said
 
 
+@pytest.mark.live
 def test_the_worst_run_is_the_same_through_real_frames_and_has_its_pictures(
     whole: tuple[Path, dict[str, Any], str],
 ) -> None:
@@ -84,6 +86,7 @@ def test_the_worst_run_is_the_same_through_real_frames_and_has_its_pictures(
     assert "the same in lock-step" in said
 
 
+@pytest.mark.live
 def test_killed_and_resumed_by_another_number_of_workers_it_is_the_same_file(
     whole: tuple[Path, dict[str, Any], str], tmp_path: Path
 ) -> None:
@@ -150,6 +153,7 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
             process.wait()
 
 
+@pytest.mark.live
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_rows(
     whole: tuple[Path, dict[str, Any], str], cluster: tuple[str, list[subprocess.Popen[bytes]]], tmp_path: Path
 ) -> None:
@@ -224,6 +228,7 @@ def test_no_scheduler_at_the_address_is_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.live
 def test_resuming_something_else_is_refused(
     whole: tuple[Path, dict[str, Any], str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
