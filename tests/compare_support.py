@@ -11,7 +11,7 @@ from campaign_support import TABLES, shared
 
 from firmware_py.core.tables import Tables
 from sim.data_files import Side, load_course, load_scenario, load_vehicle
-from tools.compare import procedure
+from tools.compare import tunings
 from tools.compare.runs import CONTROLLERS, Driver, setting_of
 
 
@@ -20,8 +20,8 @@ def tables(side: Side = "left") -> Tables:
 
 
 @cache
-def stored() -> procedure.Stored:
-    return procedure.load(procedure.STORED, load_vehicle("paper"), load_course("ohio"), TABLES)
+def stored() -> tunings.Stored:
+    return tunings.load(tunings.STORED, load_vehicle("paper"), load_course("ohio"), TABLES)
 
 
 def numbers_of(name: str, inputs: str = "raw") -> tuple[float, ...]:

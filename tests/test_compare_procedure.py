@@ -13,7 +13,7 @@ from compare_support import stored
 
 from sim.data_files import load_course, load_vehicle
 from sim.errors import UserError
-from tools.compare import command, procedure
+from tools.compare import command, procedure, tunings
 from tools.compare.procedure import EVALUATIONS, SCENARIOS, SEEDS, cost_m, tune
 from tools.compare.runs import CONTROLLERS, INPUTS, LegFigures, RunFigures
 
@@ -42,7 +42,7 @@ def test_every_controller_gets_the_same_budget_and_runs(name: str) -> None:
 
 
 def test_all_but_the_shipped_law_are_tuned_for_both_inputs_by_this_procedure() -> None:
-    content = json.loads(procedure.STORED.read_text())
+    content = json.loads(tunings.STORED.read_text())
     assert set(content["tunings"]) == set(CONTROLLERS) - {"car"}
     assert content["procedure"]["evaluations"] == EVALUATIONS
     assert content["procedure"]["version"] == procedure.VERSION
@@ -86,24 +86,29 @@ def test_training_and_measured_seeds_are_apart() -> None:
 def test_another_path_or_car_makes_the_tunings_stale(tmp_path: Path) -> None:
     other = tmp_path / "tables"
     shutil.copytree(TABLES, other)
-    (other / "path.csv").write_text((other / "path.csv").read_text() + "\n")
-    found = procedure.load(procedure.STORED, load_vehicle("paper"), load_course("ohio"), other)
-    assert "path changed" in found.stale
-    found = procedure.load(procedure.STORED, load_vehicle("fusion"), load_course("ohio"), TABLES)
-    assert {"vehicle changed", "made for paper on ohio"} <= set(found.stale)
+    lines = (other / "path.csv").read_text().splitlines()
+    header = next(index for index, line in enumerate(lines) if line.startswith("station_m"))
+    for shift, changed in ((0.05, False), (0.3, True)):
+        moved = [line.split(",") for line in lines[header + 1 :]]
+        moved = [[row[0], row[1], str(float(row[2]) + shift), *row[3:]] for row in moved]
+        (other / "path.csv").write_text("\n".join([lines[header], *map(",".join, moved)]) + "\n")
+        found = tunings.load(tunings.STORED, load_vehicle("paper"), load_course("ohio"), other)
+        assert ("the path changed" in found.stale) is changed
+    found = tunings.load(tunings.STORED, load_vehicle("fusion"), load_course("ohio"), TABLES)
+    assert {"the vehicle changed", "made for paper on ohio"} <= set(found.stale)
 
 
 def test_the_digest_is_of_the_code_not_of_its_comments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in procedure.SOURCES:
-        shutil.copy(procedure.STORED.with_name(name), tmp_path / name)
-    before = procedure.code_digest()
-    monkeypatch.setattr(procedure, "STORED", tmp_path / "tunings.json")
+    for name in tunings.SOURCES:
+        shutil.copy(tunings.STORED.with_name(name), tmp_path / name)
+    before = tunings.code_digest()
+    monkeypatch.setattr(tunings, "STORED", tmp_path / "tunings.json")
     laws = tmp_path / "laws.py"
     text = laws.read_text()
     laws.write_text(text.replace("import math\n", "import math  # of course\n", 1))
-    assert procedure.code_digest() == before
+    assert tunings.code_digest() == before
     laws.write_text(text.replace("PREVIEW_S = 0.5", "PREVIEW_S = 0.6"))
-    assert procedure.code_digest() != before
+    assert tunings.code_digest() != before
 
 
 @pytest.mark.parametrize(
@@ -115,9 +120,9 @@ def test_the_digest_is_of_the_code_not_of_its_comments(tmp_path: Path, monkeypat
     ],
 )
 def test_a_file_of_tunings_that_lacks_something_is_refused(tmp_path: Path, change: object, named: str) -> None:
-    content = json.loads(procedure.STORED.read_text())
+    content = json.loads(tunings.STORED.read_text())
     change(content)  # type: ignore[operator]
     file = tmp_path / "t.json"
     file.write_text(json.dumps(content))
     with pytest.raises(UserError, match=named):
-        procedure.load(file, load_vehicle("paper"), load_course("ohio"), TABLES)
+        tunings.load(file, load_vehicle("paper"), load_course("ohio"), TABLES)

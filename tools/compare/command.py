@@ -171,12 +171,12 @@ def _tables(vehicle: Vehicle, course: Course, made: dict[str, Path], stack: Exit
 
 def _tunings(args: argparse.Namespace, prepared: Prepared) -> Any:
     """Return the stored tunings, made anew where asked for; say so where they are not of this car, path and code."""
-    from tools.compare import procedure  # noqa: PLC0415
+    from tools.compare import tunings  # noqa: PLC0415
 
-    file = args.tunings or procedure.STORED
+    file = args.tunings or tunings.STORED
     if args.tune:
         _tune(prepared, file)
-    stored = procedure.load(file, prepared.vehicle, prepared.course, prepared.tables_dir)
+    stored = tunings.load(file, prepared.vehicle, prepared.course, prepared.tables_dir)
     if stored.stale:
         print(
             f"parkctl: warning: {file.name}: the tunings are stale ({'; '.join(stored.stale)}); "
@@ -196,7 +196,7 @@ def _compile(prepared: Prepared) -> None:
 
 
 def _tune(prepared: Prepared, file: Path) -> None:
-    from tools.compare import procedure, work  # noqa: PLC0415
+    from tools.compare import procedure, tunings, work  # noqa: PLC0415
     from tools.compare.runs import CONTROLLERS  # noqa: PLC0415
     from tools.progress import CountProgress  # noqa: PLC0415
 
@@ -216,7 +216,7 @@ def _tune(prepared: Prepared, file: Path) -> None:
     by_name = {
         name: {inputs: found[name, inputs] for inputs in it.inputs} for name, it in CONTROLLERS.items() if it.box
     }
-    procedure.store(file, by_name, prepared.vehicle, prepared.course, prepared.tables_dir)
+    tunings.store(file, by_name, prepared.vehicle, prepared.course, prepared.tables_dir)
 
 
 def _measure(prepared: Prepared, numbers: dict[tuple[str, str], tuple[float, ...]]) -> Figures:
