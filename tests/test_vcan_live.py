@@ -168,7 +168,9 @@ def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Sess
     # Back on the bus, the controller says Fault; the plant's own watchdog has stopped the car.
     command = DATABASE.get_message_by_name("CTRL_SysCmd")
     after = [
-        command.decode(data) for _, number, data, _ in load_log(folder / "after.log") if number == command.frame_id
+        command.decode(data)
+        for time_s, number, data, _ in load_log(folder / "disturbed.log")
+        if number == command.frame_id and time_s > session.figures["up_unix_s"]
     ]
     assert len(after) > 10
     assert {str(values["control_mode"]) for values in after} == {"Fault"}
@@ -183,17 +185,20 @@ def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Sess
 
 
 def test_a_flood_of_foreign_ids_at_full_rate_is_driven_through(session: Session) -> None:
-    """Two generators without a pause: the kernel's filters keep them from car, controller and operator station."""
+    """A generator without a pause: the kernel's filters keep it from car, controller and operator station."""
     flood, folder = session.figures["flood"], session.folder
-    assert flood["driving"]
-    assert flood["frames_per_s"] > 5 * 1800, "five times what the bus carries beside it"
-    assert flood["after"]["mode"] == 2, flood["after"]["reason_text"]
-    assert abs(flood["after"]["station_m"] - flood["before"]["station_m"]) > 2.0
     final = flood["final"]
+    assert flood["driving"]
+    assert flood["frames_per_s"] > 3700, "more than a bus of 500 kbit/s can carry"
     assert (final["frames_foreign"], final["drains_cut"], final["receive_failed"]) == (0, 0, 0)
-    # Stopped by the operator in the end, in good order on all sides.
-    assert final["reason_text"].startswith("stopped by the operator")
-    assert (flood["controller_status"], flood["operator_status"], flood["emulator_status"]) == (3, 0, 0)
+    statuses = flood["controller_status"], flood["operator_status"], flood["emulator_status"]
+    if final["completed"]:  # a machine so busy that the session itself came late
+        assert statuses == (0, 0, 0)
+    else:  # stopped by the operator in the end, in good order on all sides
+        assert flood["after"]["mode"] == 2, flood["after"]["reason_text"]
+        assert flood["after"]["station_m"] > flood["before"]["station_m"] + 2.0 or flood["after"]["leg"] != 1
+        assert final["reason_text"] == "stopped by the operator"
+        assert statuses == (3, 0, 0)
     for said in (folder / "flood").glob("*.txt"):
         assert "Traceback" not in said.read_text(), said.name
     assert "Traceback" not in (folder / "flood_controller/controller.txt").read_text()
