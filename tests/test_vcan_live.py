@@ -189,7 +189,7 @@ def test_a_flood_of_foreign_ids_at_full_rate_is_driven_through(session: Session)
     flood, folder = session.figures["flood"], session.folder
     final = flood["final"]
     assert flood["driving"]
-    assert flood["frames_per_s"] > 3700, "more than a bus of 500 kbit/s can carry"
+    assert flood["frames_per_s"] > 1800, "as many again as the bus carries beside it"
     assert (final["frames_foreign"], final["drains_cut"], final["receive_failed"]) == (0, 0, 0)
     statuses = flood["controller_status"], flood["operator_status"], flood["emulator_status"]
     if final["completed"]:  # a machine so busy that the session itself came late

@@ -72,7 +72,7 @@ def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM, limit_s:
 
 def run(*command: str) -> None:
     """Run a tool, after the processes of the drive and before all else: a busy machine must not outlast the drive."""
-    subprocess.run(command, check=True, stdin=subprocess.DEVNULL, preexec_fn=fifo(6))  # noqa: PLW1509
+    subprocess.run(command, check=True, stdin=subprocess.DEVNULL, preexec_fn=fifo(6))
 
 
 class Controller:
