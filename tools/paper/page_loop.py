@@ -98,7 +98,8 @@ def observer(study: Study, loops: Loops, picture: Picture) -> str:
                 f"{loops.margins[DOB][0].phase_deg:.0f}&deg; and a delay margin of "
                 f"{at_100:.2f}/&omega;<sub>n</sub>, {1e3 * loops.margins[DOB][0].delay_s:.1f} ms at 100 "
                 "rad/s. "
-                "With the PID it shrinks as the speed grows. e<sub>y</sub> goes with 1/&omega;<sub>n</sub>; the factor 1.01 in "
+                "With the PID it shrinks as the speed grows. e<sub>y</sub> goes with "
+                "1/&omega;<sub>n</sub>; the factor 1.01 in "
                 "place of 1 changes it by one per cent, and the true error hardly depends on any of it.",
             ),
             note(
