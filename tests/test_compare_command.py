@@ -132,6 +132,7 @@ def test_a_claim_that_does_not_hold_is_said_not_to() -> None:
         (["--scenario", "carr"], "carr"),
         (["--seeds", "0"], "--seeds 0: must be from 1 to 10000"),
         (["--seeds", "many"], "--seeds"),
+        (["--budget", "0"], "--budget 0: must be from 1 to 1000"),
         (["--seed", "5"], "--seed 5: must be at least 1000"),
         (["--jobs", "0"], "--jobs 0: must be from 1 to 256"),
         (["--inputs", "cooked"], "--inputs"),

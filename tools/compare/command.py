@@ -61,6 +61,9 @@ Errors are the rear axle's true ones against the path: max over all seeds, p95 o
     what.add_argument("--course", default="ohio", metavar="NAME|FILE", help="the course (default: ohio)")
     how = parser.add_argument_group("how it is run")
     how.add_argument("--tune", action="store_true", help="tune all controllers anew first and store the tunings")
+    how.add_argument(
+        "--budget", type=int, default=40, metavar="N", help="candidates that --tune tries for each (default: 40)"
+    )
     how.add_argument("--tunings", type=Path, metavar="FILE", help="tunings (default: the shipped ones)")
     how.add_argument("--jobs", type=int, metavar="N", help="processes (default: one for each core)")
     out = parser.add_argument_group("what is written")
@@ -102,6 +105,8 @@ def _check(args: argparse.Namespace) -> int:
     """Check what can be checked without loading anything; return the number of processes."""
     if not 1 <= args.seeds <= MOST_SEEDS:
         raise UserError(f"--seeds {args.seeds}: must be from 1 to {MOST_SEEDS}")
+    if not 1 <= args.budget <= 1000:
+        raise UserError(f"--budget {args.budget}: must be from 1 to 1000")
     if args.seed < 1000:
         raise UserError(f"--seed {args.seed}: must be at least 1000; those below are for tuning")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -175,7 +180,7 @@ def _tunings(args: argparse.Namespace, prepared: Prepared) -> Any:
 
     file = args.tunings or tunings.STORED
     if args.tune:
-        _tune(prepared, file)
+        _tune(prepared, file, args.budget)
     stored = tunings.load(file, prepared.vehicle, prepared.course, prepared.tables_dir)
     if stored.stale:
         print(
@@ -195,14 +200,14 @@ def _compile(prepared: Prepared) -> None:
         Driver(next(iter(prepared.settings.values()))).run(CONTROLLERS["car"].law, (), "estimator", FIRST_SEED)
 
 
-def _tune(prepared: Prepared, file: Path) -> None:
+def _tune(prepared: Prepared, file: Path, budget: int) -> None:
     from tools.compare import procedure, tunings, work  # noqa: PLC0415
     from tools.compare.runs import CONTROLLERS  # noqa: PLC0415
     from tools.progress import CountProgress  # noqa: PLC0415
 
     _compile(prepared)
     settings = {name: prepared.settings[name] for name in procedure.SCENARIOS}
-    parts = [(name, inputs) for name, it in CONTROLLERS.items() if it.box for inputs in it.inputs]
+    parts = [(name, inputs, budget) for name, it in CONTROLLERS.items() if it.box for inputs in it.inputs]
     parts.sort(key=lambda part: part[0] != "mpc")  # what takes longest, first
     progress = CountProgress("tuning", "tunings", len(parts))
     progress.show(time.monotonic(), 0)
@@ -216,7 +221,7 @@ def _tune(prepared: Prepared, file: Path) -> None:
     by_name = {
         name: {inputs: found[name, inputs] for inputs in it.inputs} for name, it in CONTROLLERS.items() if it.box
     }
-    tunings.store(file, by_name, prepared.vehicle, prepared.course, prepared.tables_dir)
+    tunings.store(file, by_name, budget, prepared.vehicle, prepared.course, prepared.tables_dir)
 
 
 def _measure(prepared: Prepared, numbers: dict[tuple[str, str], tuple[float, ...]]) -> Figures:

@@ -17,16 +17,16 @@ from tools.compare.runs import CONTROLLERS, RunFigures
 
 VERSION = 1
 EVALUATIONS = 40
-"""Candidates a controller may try, the guess included."""
+"""Candidates a controller may try, the guess included, where no other budget is asked for."""
 
-EVEN = 14
-"""Of them, the guess and those that fill the box."""
+EVEN_SHARE = 0.35
+"""Share of them that are the guess and those that fill the box."""
 
 FIRST_STEP, LAST_STEP = 0.2, 0.02
 """Standard deviation of the steps around the best candidate, in shares of the box."""
 
 SCENARIOS = ("car", "car-unknown-lag")
-SEEDS = (0, 5, 10, 15)
+SEEDS = (0, 10)
 """Training runs: each of these seeds in each scenario, far from those of measured runs."""
 
 FAILED_COST_M = 1.0
@@ -66,22 +66,25 @@ def halton(index: int, base: int) -> float:
     return value
 
 
-def candidates(box: dict[str, tuple[float, float]], guess: tuple[float, ...]) -> Iterator[tuple[float, ...]]:
-    """Yield EVALUATIONS candidates; the place of the best one so far is sent back after each."""
+def candidates(
+    box: dict[str, tuple[float, float]], guess: tuple[float, ...], budget: int
+) -> Iterator[tuple[float, ...]]:
+    """Yield as many candidates as the budget allows; the place of the best one so far is sent back after each."""
     rng = random.Random("tuning")
     ends = [(math.log(low), math.log(high)) for low, high in box.values()]
     size = len(ends)
+    even = round(EVEN_SHARE * budget)
 
     def numbers(place: list[float]) -> tuple[float, ...]:
         return tuple(math.exp(low + share * (high - low)) for share, (low, high) in zip(place, ends, strict=True))
 
     best = [(math.log(value) - low) / (high - low) for value, (low, high) in zip(guess, ends, strict=True)]
     place = best
-    for index in range(EVALUATIONS):
-        if 0 < index < EVEN:
+    for index in range(budget):
+        if 0 < index < even:
             place = [halton(index, PRIMES[axis]) for axis in range(size)]
-        elif index >= EVEN:
-            done = (index - EVEN) / max(EVALUATIONS - EVEN - 1, 1)
+        elif index >= max(even, 1):
+            done = (index - even) / max(budget - even - 1, 1)
             step = FIRST_STEP * (LAST_STEP / FIRST_STEP) ** done
             place = [min(max(share + rng.gauss(0.0, step), 0.0), 1.0) for share in best]
         is_best = yield numbers(place)
@@ -89,12 +92,12 @@ def candidates(box: dict[str, tuple[float, float]], guess: tuple[float, ...]) ->
             best = place
 
 
-def tune(name: str, evaluate: Evaluate) -> Tuned:
-    """Tune one controller for one kind of input."""
+def tune(name: str, evaluate: Evaluate, budget: int = EVALUATIONS) -> Tuned:
+    """Tune one controller for one kind of input, with so many candidates."""
     controller = CONTROLLERS[name]
     training = [(scenario, seed) for seed in SEEDS for scenario in SCENARIOS]
     best, least = controller.guess, math.inf
-    search: Any = candidates(controller.box, controller.guess)
+    search: Any = candidates(controller.box, controller.guess, budget)
     given = next(search)
     evaluations = runs = 0
     while given is not None:

@@ -50,15 +50,15 @@ def drive_task(task: Task) -> tuple[Task, list[RunFigures]]:
     return task, [driver.run(law, task.numbers, task.inputs, seed) for seed in task.seeds]
 
 
-def tune_one(which: tuple[str, str]) -> tuple[tuple[str, str], Tuned]:
-    """Tune a controller for one kind of input."""
-    name, inputs = which
+def tune_one(which: tuple[str, str, int]) -> tuple[tuple[str, str], Tuned]:
+    """Tune a controller for one kind of input with a budget."""
+    name, inputs, budget = which
     law = CONTROLLERS[name].law
 
     def evaluate(numbers: tuple[float, ...], scenario: str, seed: int) -> float:
         return cost_m(_driver(scenario).run(law, numbers, inputs, seed))
 
-    return which, tune(name, evaluate)
+    return (name, inputs), tune(name, evaluate, budget)
 
 
 def _begin_worker(settings: dict[str, Setting]) -> None:
