@@ -238,7 +238,7 @@ def test_standing_poses_are_averaged_to_their_mean():
         state = estimator.estimate(leg, tables.car, gains, state, still, 1, *pose, 1)
     mean_m = sum(pose[1] for pose in poses) / len(poses)
     assert state.y_m == pytest.approx(mean_m, abs=2e-4)
-    assert state.averaged == estimator.AVERAGING_MAX
+    assert state.averaged == 100
 
 
 def test_turning_round_keeps_the_body_and_counts_station_from_the_end():

@@ -96,7 +96,7 @@ def test_a_car_that_stands_a_metre_off_does_not_start(
 
 def test_a_car_of_the_users_own_gets_tables_of_its_own(here: Path) -> None:
     text = (FOLDERS["vehicle"] / "paper.toml").read_text().replace('name = "paper"', 'name = "mine"')
-    before, after = (f"wheelbase_m = {{ nominal = {v}, low = {v}, high = {v}" for v in ("4.0", "3.9"))
+    before, after = (f"wheelbase_m = {{ nominal = {v}, low = 3.8, high = 4.2" for v in ("4.0", "3.9"))
     assert before in text
     (here / "mine.toml").write_text(text.replace(before, after))
     figures = demo("--vehicle", "mine.toml", "--no-plots")

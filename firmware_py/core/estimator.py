@@ -23,8 +23,6 @@ from firmware_py.core.path import pose_at, wrap_angle
 from firmware_py.core.schedule import Gains
 from firmware_py.core.tables import CarTable, LegTable
 
-PERIOD_S = 0.01
-
 ODOMETRY_LENGTH = 32
 """Cycles of odometry that are remembered; the latency of the pose must be less."""
 
@@ -40,19 +38,22 @@ GATE_CROSS_M = 0.15
 GATE_HEADING_RAD = 0.08
 """A pose farther than this from the expected one is not believed; several in a row are a fault (health)."""
 
-AVERAGING_MAX = 100
+AVERAGING_MAX = 400
 """Poses averaged at standstill, at most; then a first-order filter of that length."""
 
 BIAS_AVERAGING_MAX = 1000
 """Yaw rates averaged at standstill for the gyro's bias, at most."""
 
-MOVING_PRIOR = 60
+MOVING_PRIOR = 300
 """What the estimate of a moving car is worth when it comes to a stop, counted in poses and in yaw rates."""
 
 STEERING_GAIN_1PM = 1.0
 STEERING_GAIN_ANGLE_RAD = 0.1
 STEERING_GAIN_RATE_RADPS = 0.1
 """How fast the steering's gain is learnt per metre of travel, from what angle on, and up to what rate."""
+
+LEAST_DT_S = 1e-3
+"""Cycles are never nearer than this for the purpose of a rate."""
 
 STEERING_GAIN_SPREAD = 0.1
 STEERING_OFFSET_MAX_RAD = 0.03
@@ -198,7 +199,7 @@ def estimate(
         if follows != 0:
             offset_rad += gains.offset * gap_rad
             offset_rad = max(min(offset_rad, STEERING_OFFSET_MAX_RAD), -STEERING_OFFSET_MAX_RAD)
-            turning = change_rad / (STEERING_GAIN_RATE_RADPS * PERIOD_S)
+            turning = change_rad / (STEERING_GAIN_RATE_RADPS * max(dt_s, LEAST_DT_S))
             weight = modelled_rad * modelled_rad + STEERING_GAIN_ANGLE_RAD * STEERING_GAIN_ANGLE_RAD
             gain += STEERING_GAIN_1PM * abs(ds_m) * modelled_rad * gap_rad / (weight * (1.0 + turning * turning))
             gain = max(min(gain, 1.0 + STEERING_GAIN_SPREAD), 1.0 - STEERING_GAIN_SPREAD)

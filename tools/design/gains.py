@@ -44,7 +44,7 @@ YAW_RATE_NOISE_RADPS = math.radians(0.02)
 YAW_RATE_WALK = math.radians(0.002)
 """Noise of a yaw rate (rad/s a sample) and walk of the gyro's bias (rad/s per root second)."""
 
-SIDE_SLIP = 0.4e-3
+SIDE_SLIP = 0.25e-3
 HEADING_WALK = 0.2e-3
 """With the yaw rate: what the rear tyres' unknown slip moves the car aside (m), and what is left of heading that the
 yaw rate does not show (rad), per root metre of travel."""

@@ -25,11 +25,12 @@ from tools.design.waypoints import Floats, Waypoints
 class Weights(NamedTuple):
     """What a path is chosen by, besides its clearance.
 
-    angle_share: share of the car's road-wheel angle that the path may use; the rest is for feedback and steering
-    errors. slope_price_m: clearance (m) that a rad/m of steering slope must buy.
+    angle_share: share of the car's road-wheel angle that the path may use; the rest is for feedback and for errors of
+    the steering (one that makes 5 % too little and stands 1 degree aside needs 0.513 rad for 0.47). slope_price_m:
+    clearance (m) that a rad/m of steering slope must buy.
     """
 
-    angle_share: float = 0.94
+    angle_share: float = 0.88
     slope_price_m: float = 0.02
 
 

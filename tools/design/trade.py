@@ -21,8 +21,8 @@ SWEEP = (
     MOST_CLEARANCE,
     Weights(0.97, 0.005),
     Weights(0.94, 0.005),
+    Weights(0.94, 0.02),
     CHOSEN,
-    Weights(0.94, 0.05),
     Weights(0.88, 0.1),
     Weights(0.80, 0.1),
     Weights(0.70, 0.2),
@@ -33,7 +33,8 @@ NEIGHBOURS = 2
 """Designs nearest in the sweep from which a point's search begins."""
 
 SCENARIO, LAW = "car", "car"
-SIDE: Side = "left"
+SIDE: Side = "right"
+"""The side on which a bias to the left asks for most of the steering."""
 
 
 class Tracking(NamedTuple):
