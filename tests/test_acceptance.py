@@ -14,9 +14,11 @@ from core_support import TABLES
 from sim import examiner
 from sim.data_files import SIDES, load_course, load_scenario, load_vehicle
 from sim.examiner import TOUCHED
+from sim.plant import TruthRow
 from tools.campaign import manoeuvre
 from tools.campaign.single import Runner, share
 from tools.design.tables import design_tables
+from tools.figures import load_path, project
 
 FIRST_SEED = 1000
 SEEDS = 100
@@ -42,8 +44,9 @@ BOUNDS = {
     "car-quiet": Bounds(3.0),
     "car": Bounds(4.5, rms_mm=1.2, final_mm=3.0, final_deg=0.1),
     "car-unknown-lag": Bounds(6.0),
-    "car-drift": Bounds(30.0, 25.0, 8.0),
-    "car-drift-3mm": Bounds(10.0, rms_mm=3.0),
+    # A localisation error that stays for seconds is followed: the best filter for it alone would leave 7.3 mm rms.
+    "car-drift": Bounds(36.0, 29.0, 9.8),
+    "car-drift-3mm": Bounds(11.0, rms_mm=3.0),
     "slow-rack": Bounds(10.0, rms_mm=3.5),
 }
 
@@ -98,11 +101,22 @@ def test_clearance_is_kept(runner_of):
     assert least_m >= 0.30
 
 
-def test_a_start_off_the_path_is_corrected_within_four_metres(runner_of):
-    for what, outcome in runs_of(runner_of("start-offset"), "start-offset", 30, trace_rows=2000):
+@pytest.mark.parametrize("side", SIDES)
+def test_a_start_off_the_path_is_corrected_within_four_metres(runner_of, side):
+    runner, scenario, path = runner_of("start-offset"), load_scenario("start-offset"), load_path(TABLES, side)
+    largest_start_m = 0.0
+    for seed in range(FIRST_SEED, FIRST_SEED + 30):
+        outcome = runner.run(scenario, side, seed, trace_rows=1500)
+        what = f"start-offset, {side}, seed {seed}"
         assert outcome.end[manoeuvre.COMPLETED], what
         assert outcome.notes.number[TOUCHED] == 0, what
         assert outcome.notes.value[examiner.MIN_CLEARANCE_M] >= 0.20, what
+        truth = TruthRow(*outcome.trace[outcome.trace[:, TruthRow._fields.index("t_s")] > 0.0].T)
+        on_path = project(path, truth.x_m, truth.y_m, truth.yaw_rad)
+        largest_start_m = max(largest_start_m, abs(on_path.cross_track_error_m[0]))
+        corrected = np.argmax(on_path.station_m > on_path.station_m[0] + 4.0)
+        assert np.abs(on_path.cross_track_error_m[corrected:]).max() <= 5e-3, what
+    assert largest_start_m > 0.04
 
 
 def test_a_slow_rack_that_the_tables_do_not_know_is_noticed_and_the_car_stops_before_a_cone(runner_of):

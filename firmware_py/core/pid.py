@@ -11,9 +11,18 @@ INTEGRAL_AUTHORITY_1PM = 0.02
 """Greatest curvature that the integral part may ask for: several times a steering bias, far below the car's."""
 
 
+CROSS_TRACK_MAX_M = 0.038
+"""A car that is farther off comes back at the angle that this asks for: about 2 degrees. Between the cones of the box a
+steeper way back would swing the body's ends out."""
+
+
 def preview_error_m(cross_track_error_m: float, heading_error_rad: float, preview_m: float, sigma: float) -> float:
-    """Return the cross-track error of the point `preview_m` ahead in the direction of travel, positive to the left."""
-    return cross_track_error_m + sigma * preview_m * math.sin(heading_error_rad)
+    """Return the cross-track error of the point `preview_m` ahead in the direction of travel, positive to the left.
+
+    Of the cross-track error itself no more than CROSS_TRACK_MAX_M counts.
+    """
+    cross_m = max(min(cross_track_error_m, CROSS_TRACK_MAX_M), -CROSS_TRACK_MAX_M)
+    return cross_m + sigma * preview_m * math.sin(heading_error_rad)
 
 
 def feedback_1pm(
