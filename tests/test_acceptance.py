@@ -88,8 +88,8 @@ def test_figures_of_a_scenario(runner_of, record_property, scenario_name):
         final_mm = max(final_mm, 1e3 * np.abs(legs[:, manoeuvre.FINAL_ERROR_M]).max())
         final_deg = max(final_deg, np.degrees(np.abs(legs[:, manoeuvre.FINAL_HEADING_RAD]).max()))
     p95_mm, rms_mm = float(np.quantile(largest_mm, 0.95)), float(np.sqrt(squares_mm2 / samples))
-    found = Bounds(max(largest_mm), p95_mm, rms_mm, final_mm, final_deg)
-    record_property("found", found._asdict())
+    found = Bounds(*(float(value) for value in (max(largest_mm), p95_mm, rms_mm, final_mm, final_deg)))
+    record_property("found", found._asdict())  # plain floats: they travel between processes
     for name, bound in BOUNDS[scenario_name]._asdict().items():
         assert bound is None or getattr(found, name) <= bound, f"{scenario_name}: {name} of {found}"
 
