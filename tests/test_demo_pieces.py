@@ -29,7 +29,7 @@ from tools.buses import (
     refuse_occupied_bus,
 )
 from tools.card import print_card, print_figures
-from tools.operator_station import DBC, Station, exchange, text_of_state
+from tools.operator_station import DBC, Ending, Station, ending_of, exchange, text_of_state
 from tools.processes import Child
 from tools.progress import Moment, Progress, line_of
 from tools.run_folder import MARK, RunFolder, check_writable_file, write_whole
@@ -381,6 +381,60 @@ def test_state_in_words_and_silence_after_the_timeout() -> None:
     assert text_of_state(station, 0).startswith("controller Fault, Forward, OperatorStop | vehicle Ready, None")
     assert "stopped by the operator (OperatorStop)" in station.reason_text
     assert text_of_state(station, 200 * MS) == "controller silent | vehicle silent"
+
+
+def hear_car(station: Station, side: CanSide, now_ns: int, *, standstill: int) -> None:
+    names = {item.name for item in station.side.received["VEH_LongRpt"].message.signals}
+    station.hear(now_ns, *side.encode("VEH_LongRpt", {**dict.fromkeys(names, 0), "standstill": standstill}))
+
+
+ACTIVE_IN_CHANGE, FAULT_BY_TIMEOUT = {"mode": 2, "leg": 2}, {"mode": 3, "leg": 2, "reason": 13}
+
+
+@pytest.mark.parametrize(
+    ("controller_says", "standstill", "silence_ms", "ending"),
+    [
+        (ACTIVE_IN_CHANGE, 1, 0, None),
+        (FAULT_BY_TIMEOUT, 0, 0, None),
+        (FAULT_BY_TIMEOUT, 1, 0, "VEH_SysRpt was missing for its timeout (SysReportTimeout)"),
+        # The bus is away while the car stands in the change of direction: the reason is still to come.
+        (ACTIVE_IN_CHANGE, 1, 400, None),
+        (ACTIVE_IN_CHANGE, 1, 4900, None),
+        (
+            ACTIVE_IN_CHANGE, 1, 5100,
+            "the controller fell silent on the bus; its last words: Active, DirectionChange, None"
+            "; the vehicle is silent, too",
+        ),
+        (FAULT_BY_TIMEOUT, 0, 400, None),
+        (
+            FAULT_BY_TIMEOUT, 0, 5100,
+            "VEH_SysRpt was missing for its timeout (SysReportTimeout); the vehicle is silent, too",
+        ),
+        ({"mode": 0, "leg": 0, "reason": 2}, 1, 0, "the controller has begun anew: Manual, Idle, WaitingForOperator"),
+        ({"mode": 0, "leg": 4, "reason": 31}, 1, 0, "completed"),
+        ({"mode": 0, "leg": 4, "reason": 31}, 0, 0, None),
+    ],
+)  # fmt: skip
+def test_how_a_manoeuvre_is_over(
+    controller_says: dict[str, int], standstill: int, silence_ms: int, ending: str | None
+) -> None:
+    station, controller, vehicle = Station(DBC), CanSide(DBC, nodes=("CTRL",)), CanSide(DBC)
+    hear(station, controller, MS, **controller_says)
+    hear_car(station, vehicle, MS, standstill=standstill)
+    found = ending_of(station, (1 + silence_ms) * MS)
+    expected = None if ending is None else Ending(ending == "completed", "" if ending == "completed" else ending)
+    assert found == expected
+
+
+def test_a_controller_that_dies_beside_a_standing_car_is_told() -> None:
+    station, controller, vehicle = Station(DBC), CanSide(DBC, nodes=("CTRL",)), CanSide(DBC)
+    hear(station, controller, 0, 2, leg=1)
+    for t in range(0, 5010, 10):
+        hear_car(station, vehicle, t * MS, standstill=int(t > 1000))
+        assert (ending_of(station, t * MS) is None) == (t <= 5000), t
+    hear_car(station, vehicle, 5010 * MS, standstill=1)
+    why = "the controller fell silent on the bus; its last words: Active, Forward, None"
+    assert ending_of(station, 5010 * MS) == Ending(False, why)
 
 
 def test_exchange_sends_hears_and_returns_all_frames() -> None:

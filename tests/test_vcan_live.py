@@ -156,6 +156,8 @@ def test_a_load_of_foreign_frames_disturbs_nothing(session: Session) -> None:
 def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Session) -> None:
     disturbed, folder = session.figures["disturbed"], session.folder
     final = disturbed["final"]
+    assert disturbed["moving"]
+    assert disturbed["noticed"]
     assert disturbed["controller_status"] == 3, "ended in good order, stopped before the end"
     assert final["send_failed"] > 30
     assert re.search(

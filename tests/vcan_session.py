@@ -1,6 +1,7 @@
 """What the tests of the real vcan0 do inside the guest: one boot, four runs, all results as files in FOLDER.
 
-`python vcan_session.py FOLDER IDS`: IDS are the frame ids, in hexadecimal, that a replay feeds to the controller.
+`python vcan_session.py FOLDER IDS [STEP ...]`: IDS are the frame ids, in hexadecimal, that a replay feeds to the
+controller; without a step all of them.
 Standard library only: every import costs its time again in the guest.
 """
 
@@ -24,11 +25,17 @@ FOLDER = Path(sys.argv[1])
 FED_IDS = set(sys.argv[2].split(","))
 ROOT = Path(__file__).resolve().parent.parent
 BUS = ["-i", "socketcan", "-c", "vcan0"]
-ACTIVE = 2
+ACTIVE, FAULT = 2, 3
+FORWARD, REVERSE = 1, 3
 FORGED_EACH = 5
 ERROR_FRAMES = 4
 FLOOD_S = 5.0
 LEAD_IN_S = 1.0
+FED_EARLIER_S = 0.002
+"""Frames are fed so much earlier in the controller's cycle than they were recorded: canplayer is up to 1 ms late."""
+CYCLE_S = 0.01
+SET_PIPE_SIZE = 1031
+"""fcntl.F_SETPIPE_SZ, for an interpreter without it."""
 FED_AFTER_START_S = 9.0
 """So long after the start button the recorded frames are fed."""
 ATTEMPTS = 3
@@ -101,6 +108,12 @@ class Controller:
         return False
 
 
+def on_its_way(report: dict[str, Any]) -> bool:
+    """Whether the car drives on a leg, some way from both ends of it."""
+    driving = report.get("mode") == ACTIVE and report.get("leg") in (FORWARD, REVERSE) and not report["standstill"]
+    return driving and abs(report["station_m"]) > 1.0
+
+
 def manoeuvre() -> None:
     """The whole test by `parkctl demo`, with candump beside it."""
     recorder = candump("candump.log")
@@ -140,21 +153,22 @@ def disturbances() -> None:
     figures["load_s"] = time.monotonic() - began_s
     time.sleep(0.3)
     before = controller.reports()[-1]
+    # A machine that was busy meanwhile may have brought the car to the end of a leg, where it stands anyway.
+    moving = controller.wait_for(on_its_way, 30.0)
     run("ip", "link", "set", "vcan0", "down")
     figures["down_unix_s"] = time.time()
-    time.sleep(0.15)
+    noticed = controller.wait_for(lambda report: report.get("mode") == FAULT, 8.0)
     run("ip", "link", "set", "vcan0", "up")
     figures["up_unix_s"] = time.time()
-    try:
-        status: int | None = controller.process.wait(30.0)
-    except subprocess.TimeoutExpired:
-        status = None
+    status = wait_or_kill(controller.process, 30.0)
     figures["disturbed"] = {
         "driving": driving,
         "before": before,
+        "moving": moving,
+        "noticed": noticed,
         "controller_status": status,
         "final": controller.reports()[-1].get("final"),
-        "operator_status": end(operator, signal.SIGINT),
+        "operator_status": wait_or_kill(operator),
         "emulator_status": end(car, signal.SIGINT),
     }
     end(recorder)
@@ -197,10 +211,10 @@ def flood() -> None:
     }
 
 
-def wait_or_kill(process: subprocess.Popen[bytes]) -> int | None:
+def wait_or_kill(process: subprocess.Popen[bytes], limit_s: float = 20.0) -> int | None:
     """Return the exit status of a process that should end by itself; None where it hangs."""
     try:
-        return process.wait(20.0)
+        return process.wait(limit_s)
     except subprocess.TimeoutExpired:
         process.kill()
         return None
@@ -244,6 +258,25 @@ def lead_in(lines: list[str]) -> list[str]:
     return [f"({time_s:.6f}) vcan0 {name}#{payload.hex().upper()}" for time_s, name, payload in sorted(made)]
 
 
+def play(file: Path) -> int:
+    """Run canplayer such that the frames come at the phase of the controller's cycle at which they were recorded.
+
+    At another one they might come as the cycle begins, some before and some after it. canplayer's time begins with the
+    first line that it gets, and the controller's cycle with multiples of 10 ms of the monotonic clock.
+    """
+    text = file.read_bytes()
+    recorded_s = float(text[1 : text.index(b")")]) - (time.time() - time.monotonic())
+    reading, writing = os.pipe()
+    fcntl.fcntl(writing, SET_PIPE_SIZE, len(text))
+    player = subprocess.Popen(["canplayer"], stdin=reading, preexec_fn=fifo(75))  # noqa: PLW1509
+    os.close(reading)
+    time.sleep(1.0)  # it waits for its first line by now
+    time.sleep((recorded_s - FED_EARLIER_S - time.monotonic()) % CYCLE_S)
+    os.write(writing, text)
+    os.close(writing)
+    return player.wait()
+
+
 def replay() -> None:
     """The recorded frames of car, localisation and operator, fed by canplayer; cantools monitor on a terminal."""
     fed = FOLDER / "fed.log"
@@ -274,8 +307,7 @@ def replay() -> None:
         recorder = candump("replayed.log")
         controller = Controller(f"replayed{attempt}")
         ready = controller.wait_for(lambda report: True, 30.0)
-        player = start("canplayer", "-I", fed, priority=75)
-        status = player.wait()
+        status = play(fed)
         driven = any(report.get("mode") == ACTIVE for report in controller.reports())
         end(controller.process, signal.SIGKILL)  # it would wait for a car to stand that is not there
         end(recorder)
@@ -305,7 +337,8 @@ with open(sys.argv[1], "wb") as file:
 if __name__ == "__main__":
     # The drive takes most of the one CPU, and the flood all that is left of it.
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(6))
-    for step in (manoeuvre, disturbances, flood, replay):
+    steps = {step.__name__: step for step in (manoeuvre, disturbances, flood, replay)}
+    for step in [steps[name] for name in sys.argv[3:]] or steps.values():
         began_s = time.monotonic()
         step()
         figures[f"{step.__name__}_s"] = time.monotonic() - began_s

@@ -35,6 +35,8 @@ NO_REASON = "None"
 CLEAR_HOLD_S = 0.5
 START_HOLD_S = 0.3
 SLOWEST_MOTION = 1000
+GONE_S = 5.0
+"""Who was heard once, and then not for so long, is not waited for: longer than an interface takes to come up again."""
 POLL_S = 0.005
 """Longest wait of a loop that plays the station: a quarter of the heartbeat's cycle time."""
 
@@ -116,6 +118,10 @@ class Station:
         """Whether no valid frame of the message has come for its timeout."""
         return name not in self.heard_ns or now_ns - self.heard_ns[name] > self.side.timeout_ns(name)
 
+    def is_gone(self, name: str, now_ns: int) -> bool:
+        """Whether the message has been heard, and then not for GONE_S."""
+        return name in self.heard_ns and now_ns - self.heard_ns[name] > 1e9 * GONE_S
+
     def text(self, message: str, signal_name: str) -> str:
         """Return a signal's newest value as the DBC's value table names it; empty where nothing was heard."""
         value = self.values.get(message, {}).get(signal_name)
@@ -163,6 +169,37 @@ class Station:
         self._has_driven = False
 
 
+class Ending(NamedTuple):
+    """How a manoeuvre that had begun is over: whether completed, and if not, why, in plain words."""
+
+    completed: bool
+    why: str
+
+
+def ending_of(station: Station, now_ns: int) -> Ending | None:
+    """Return how the manoeuvre is over, for a controller that has been Active; None while it may go on.
+
+    Over it is only with a car that is heard to stand, or is not heard any more: a controller that still waits for the
+    gear misses its operator. A short silence decides nothing. Who is silent because the bus was away has a reason to
+    tell afterwards; and a car may well stand while its controller drives, as in the change of direction.
+    """
+    car_gone = station.is_gone("VEH_LongRpt", now_ns)
+    stands = station.standstill and not station.is_silent("VEH_LongRpt", now_ns)
+    if not (stands or car_gone):
+        return None
+    where = "" if stands else "; the vehicle is silent, too"
+    last = f"{station.mode}, {station.leg}, {station.reason}"
+    if station.mode == MANUAL and station.reason == COMPLETE:
+        return Ending(completed=True, why="")
+    if station.mode == FAULT:
+        return Ending(completed=False, why=station.reason_text + where)
+    if station.is_gone("CTRL_SysCmd", now_ns):
+        return Ending(completed=False, why=f"the controller fell silent on the bus; its last words: {last}{where}")
+    if station.mode in (MANUAL, READY) and not station.is_silent("CTRL_SysCmd", now_ns):
+        return Ending(completed=False, why=f"the controller has begun anew: {last}{where}")
+    return None
+
+
 def text_of_state(station: Station, now_ns: int) -> str:
     """Return one line on how controller and vehicle are."""
     if station.is_silent("CTRL_SysCmd", now_ns):
@@ -199,7 +236,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Be the operator station until the operator quits; with --auto until the manoeuvre is over.
 
-    Exit status 0 where the operator quit, or the manoeuvre was completed; 1 where the controller stopped with a fault.
+    Exit status 0 where the operator quit, or the manoeuvre was completed; 1 where it was not: the controller stopped
+    with a fault, or was not heard any more.
     """
     if not args.auto and not sys.stdin.isatty():
         raise UserError("operate: its keys need a terminal; use --auto to press start without one")
@@ -271,14 +309,12 @@ class _Console:
             station.stop, station.start = True, False
             moving = not station.is_silent("VEH_LongRpt", now_ns) and not station.standstill
             return 0 if self._quits > 1 or not moving else None
-        if self._auto and self._was_active and station.standstill:
-            # Not before the car is parked: a controller that still waits for the gear misses its operator.
-            if station.mode == MANUAL and station.reason == COMPLETE:
-                return 0
-            if station.mode == FAULT or station.is_silent("CTRL_SysCmd", now_ns):
-                print(f"parkctl: stopped: {station.reason_text}", file=sys.stderr)
-                return 1
-        return None
+        ending = ending_of(station, now_ns) if self._auto and self._was_active else None
+        if ending is None:
+            return None
+        if not ending.completed:
+            print(f"parkctl: stopped: {ending.why}", file=sys.stderr)
+        return 0 if ending.completed else 1
 
     def _keys(self, now_ns: int) -> None:
         while select.select([sys.stdin], [], [], 0)[0]:
