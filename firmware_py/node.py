@@ -66,7 +66,9 @@ def build_tables(table_set: TableSet, codec: Codec) -> Tables:
         dbc_hash24=codec.dbc_hash24,
         vehicle_hash24=table_set.vehicle_hash24,
         road_wheel_angle_lsb_rad=codec.scale("road_wheel_angle_cmd_rad"),
-        uses_predictor=table_set.uses_predictor,
+        law=table_set.law,
+        paper=table_set.paper,
+        reference=table_set.reference,
     )
 
 

@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from firmware_py.core import estimator, motion
-from firmware_py.core.tables import GAIN_COLUMNS, CarTable, GainTable, LegTable
+from firmware_py.core.tables import (
+    GAIN_COLUMNS,
+    LAW_CAR,
+    LAW_PAPER,
+    LAW_PLAIN,
+    CarTable,
+    GainTable,
+    LegTable,
+    PaperTable,
+    ReferencePath,
+)
 from firmware_py.errors import UserError
 from firmware_py.feedforward import slip_feedforward
 
@@ -44,9 +54,27 @@ GAINS_COLUMNS = (
     "m_de",
     "m_dp",
 )
-LAWS = {"car": 1, "pid+ff": 0}
-"""The laws by name, and whether each predicts over latency and lag. A law without observer has one in its table that
-takes each pose as it comes (l_ee = l_pp = m_ee = m_pp = 1, the rest 0)."""
+PAPER_COLUMNS = (
+    "direction",
+    "speed_mps",
+    "preview_m",
+    "kp",
+    "ki",
+    "kd",
+    "inverse_gain",
+    "inverse_pole",
+    "q_b1",
+    "q_b2",
+    "q_a1",
+    "q_a2",
+)
+LAWS = {"car": LAW_CAR, "pid+ff": LAW_PLAIN, "paper": LAW_PAPER, "dob": LAW_PAPER, "pid": LAW_PAPER}
+"""The laws by name. A law without observer has one in its table that takes each pose as it comes (l_ee = l_pp = m_ee =
+m_pp = 1, the rest 0); the paper's laws have that one beside their own table: `paper` both parts, `dob`, `pid` one."""
+
+NO_PAPER = PaperTable((0.0, 1.0), 1, (((0.0,) * 6,) * 2,) * 2, 0.0, 0.0, 0.0, 0.0, 0, 0)
+NO_REFERENCE = ReferencePath(0.0, *[((0.0, 0.0),) * 2] * 3)
+"""What stands in the tables of the other laws."""
 
 SIDES = {"left": 1.0, "right": -1.0}
 
@@ -82,7 +110,9 @@ class TableSet(NamedTuple):
     legs: tuple[LegTable, LegTable]
     gains: GainTable
     car: CarTable
-    uses_predictor: int
+    law: int
+    paper: PaperTable
+    reference: ReferencePath
 
 
 def load_tables(folder: Path, side: str, law: str, period_s: float, dbc_folder: Path | None = None) -> TableSet:
@@ -99,7 +129,11 @@ def load_tables(folder: Path, side: str, law: str, period_s: float, dbc_folder: 
     path = _read_csv(folder / "path.csv", PATH_COLUMNS)
     speed = _read_csv(folder / "speed.csv", SPEED_COLUMNS)
     legs = _legs(folder, path, speed, physics, SIDES[side])
-    gains = _load_gains(folder / f"gains_{law.replace('+', '_')}.csv")
+    kind, paper, reference = LAWS[law], NO_PAPER, NO_REFERENCE
+    gains = _load_gains(folder / gains_file("pid+ff" if kind == LAW_PAPER else law))
+    if kind == LAW_PAPER:
+        paper = _load_paper(folder / gains_file(law))
+        reference = _reference(legs, path, SIDES[side], physics["cg_to_rear_axle_m"])
     return TableSet(
         vehicle=str(manifest["vehicle"]),
         course=str(manifest["course"]),
@@ -107,8 +141,15 @@ def load_tables(folder: Path, side: str, law: str, period_s: float, dbc_folder: 
         legs=legs,
         gains=gains,
         car=car,
-        uses_predictor=LAWS[law],
+        law=kind,
+        paper=paper,
+        reference=reference,
     )
+
+
+def gains_file(law: str) -> str:
+    """Return the name of a law's own table."""
+    return f"gains_{law.replace('+', '_')}.csv"
 
 
 def _read_bytes(file: Path) -> bytes:
@@ -267,3 +308,52 @@ def _load_gains(file: Path) -> GainTable:
         raise UserError(f"{file}: directions +1 and -1 must have the same speeds and no other rows; {REMEDY}")
     gain = tuple(tuple(row[2 : 2 + GAIN_COLUMNS] for row in rows_of) for rows_of in by_direction)
     return GainTable(speed_grid_mps=grid, last_row=len(grid) - 1, gain=gain)
+
+
+def _load_paper(file: Path) -> PaperTable:
+    """Return the table of one of the paper's laws; a part whose columns are all zero is not in it."""
+    rows = _read_csv(file, PAPER_COLUMNS)
+    by_direction = [[row for row in rows if row[0] == direction] for direction in (1.0, -1.0)]
+    grid = tuple(row[1] for row in by_direction[0])
+    if len(grid) < 2 or grid[0] < 0.0 or any(b <= a for a, b in pairwise(grid)):
+        raise UserError(f"{file}: speed_mps must increase, none below 0, in direction +1; {REMEDY}")
+    if tuple(row[1] for row in by_direction[1]) != grid or len(rows) != 2 * len(grid):
+        raise UserError(f"{file}: directions +1 and -1 must have the same speeds and no other rows; {REMEDY}")
+    for number, row in enumerate(rows, 1):
+        for name, value in zip(PAPER_COLUMNS[2:7], row[2:7], strict=True):
+            if value < 0.0:
+                raise UserError(f"{file}: row {number}: {name} is {value:g}, must not be negative; {REMEDY}")
+        if not -1.0 < row[7] < 1.0:
+            raise UserError(f"{file}: row {number}: inverse_pole is {row[7]:g}, must be between -1 and 1; {REMEDY}")
+        if row[8:] != rows[0][8:]:
+            raise UserError(f"{file}: row {number}: q_b1 to q_a2 must be the same in every row; {REMEDY}")
+    b1, b2, a1, a2 = rows[0][8:]
+    has_observer = any(rows[0][8:])
+    if has_observer and not (abs(a2) < 1.0 and abs(a1) < 1.0 + a2 and abs((b1 + b2) / (1.0 + a1 + a2) - 1.0) < 1e-6):
+        raise UserError(f"{file}: q_b1 to q_a2 must be a stable filter of gain 1; {REMEDY}")
+    return PaperTable(
+        speed_grid_mps=grid,
+        last_row=len(grid) - 1,
+        row=tuple(tuple(row[2:8] for row in rows_of) for rows_of in by_direction),
+        q_b1=b1,
+        q_b2=b2,
+        q_a1=a1,
+        q_a2=a2,
+        uses_pid=int(any(any(row[3:6]) for row in rows)),
+        uses_observer=int(has_observer),
+    )
+
+
+def _reference(
+    legs: tuple[LegTable, LegTable], path: list[tuple[float, ...]], mirror: float, ahead_m: float
+) -> ReferencePath:
+    """Return where the point `ahead_m` ahead of the rear axle goes on both legs."""
+    curvature = [mirror * row[4] for row in path]
+    x, y, yaw = [], [], []
+    for leg, travelled in ((legs[0], curvature), (legs[1], curvature[::-1])):
+        x.append(tuple(at + ahead_m * math.cos(heading) for at, heading in zip(leg.x_m, leg.yaw_rad, strict=True)))
+        y.append(tuple(at + ahead_m * math.sin(heading) for at, heading in zip(leg.y_m, leg.yaw_rad, strict=True)))
+        yaw.append(
+            tuple(heading + math.atan(ahead_m * bend) for heading, bend in zip(leg.yaw_rad, travelled, strict=True))
+        )
+    return ReferencePath(ahead_m, tuple(x), tuple(y), tuple(yaw))

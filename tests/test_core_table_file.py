@@ -7,6 +7,7 @@ import pytest
 from core_support import ROOT, TABLES
 
 from firmware_py.core.controller import PERIOD_S
+from firmware_py.core.tables import LAW_CAR, LAW_PLAIN
 from firmware_py.errors import UserError
 from firmware_py.table_file import load_tables
 
@@ -39,8 +40,8 @@ def rewrite(folder, name, edit):
 
 def test_the_shipped_tables_load_and_are_fresh():
     tables = load_tables(TABLES, "left", "car", PERIOD_S, ROOT / "dbc")
-    assert (tables.vehicle, tables.course, tables.uses_predictor) == ("paper", "ohio", 1)
-    assert load_tables(TABLES, "left", "pid+ff", PERIOD_S).uses_predictor == 0
+    assert (tables.vehicle, tables.course, tables.law) == ("paper", "ohio", LAW_CAR)
+    assert load_tables(TABLES, "left", "pid+ff", PERIOD_S).law == LAW_PLAIN
 
 
 def test_missing_folder_and_missing_file(folder, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core import paper_law
-from tools.compiled import compile_modules
+from tools.compiled import compile_modules, core_modules
 from tools.paper import firmware_law, fit, sampled_run
 from tools.paper.laws import BOTH, DOB, PID, Gains, Law, Observer
 from tools.paper.path_study import AS_PRINTED, all_variants
@@ -19,6 +19,7 @@ from tools.paper.sampled import Path as Delay
 from tools.paper.track import Track, track_of
 
 GAINS = Gains(60.0, 10.0, 0.5)
+UNBOUNDED = firmware_law.UNBOUNDED
 SPEED_MPS = firmware_law.SPEEDS_MPS[20]
 
 
@@ -30,9 +31,9 @@ def tracks() -> dict[str, Track]:
 
 def driven(law: str, errors: list[float], direction: int = 0) -> list[float]:
     table = firmware_law.tables_of(TABLE_4, Law(law, GAINS))
-    state, angles = paper_law.begin(), []
+    state, angles = paper_law.clear(), []
     for error in errors:
-        state, angle = paper_law.step(table, state, direction, SPEED_MPS, error)
+        state, angle = paper_law.step(table, state, UNBOUNDED, direction, SPEED_MPS, error, 0.0)
         angles.append(angle)
     return angles
 
@@ -82,15 +83,15 @@ def test_the_integral_is_clamped() -> None:
 
 
 def test_compiled_and_plain_agree_bit_for_bit() -> None:
-    step = compile_modules("firmware_py.core.tables", "firmware_py.core.paper_law")["firmware_py.core.paper_law"].step
+    step = compile_modules(*core_modules())["firmware_py.core.paper_law"].step
     plain = firmware_law.tables_of(TABLE_4, Law(BOTH, GAINS))
     arrays = plain._replace(speed_grid_mps=np.array(plain.speed_grid_mps), row=np.array(plain.row))  # type: ignore[arg-type]
     rng = random.Random(6)
-    ours = theirs = paper_law.begin()
+    ours = theirs = paper_law.clear()
     for _ in range(300):
         direction, speed, error = rng.randrange(2), rng.uniform(0.0, 1.2), rng.uniform(-0.01, 0.01)
-        ours, angle = paper_law.step(plain, ours, direction, speed, error)
-        theirs, compiled = step(arrays, theirs, direction, speed, error)
+        ours, angle = paper_law.step(plain, ours, UNBOUNDED, direction, speed, error, 0.0)
+        theirs, compiled = step(arrays, theirs, UNBOUNDED, direction, speed, error, 0.0)
         assert (compiled, tuple(theirs)) == (angle, tuple(ours))
 
 

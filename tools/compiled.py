@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.core.tables import GainTable, LegTable, Tables
+from firmware_py.core.tables import GainTable, LegTable, ReferencePath, Tables
 
 CORE = "firmware_py.core"
 CORE_MODULES = (
@@ -31,6 +31,7 @@ CORE_MODULES = (
     "predictor",
     "pid",
     "limits",
+    "paper_law",
     "speed",
     "health",
     "supervisor",
@@ -104,7 +105,16 @@ def array_tables(tables: Tables) -> Tables:
             last_row=tables.gains.last_row,
             gain=np.array(tables.gains.gain),  # type: ignore[arg-type]
         ),
+        paper=tables.paper._replace(
+            speed_grid_mps=np.array(tables.paper.speed_grid_mps),  # type: ignore[arg-type]
+            row=np.array(tables.paper.row),  # type: ignore[arg-type]
+        ),
+        reference=ReferencePath(tables.reference.ahead_m, *_array_columns(tables.reference[1:])),
     )
+
+
+def _array_columns(columns: tuple[Any, ...]) -> list[Any]:
+    return [np.array(rows) for rows in columns]
 
 
 def _array_leg(leg: LegTable) -> LegTable:

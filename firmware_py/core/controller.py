@@ -1,7 +1,7 @@
 """One control cycle, from reports to commands: the straight line of the whole controller.
 
-    health -> supervisor -> manoeuvre -> schedule -> estimator -> predictor -> feedforward + PID -> limits -> speed
-    -> gate
+    health -> supervisor -> manoeuvre -> schedule -> estimator -> predictor -> feedforward + PID (or the paper's law)
+    -> limits -> speed -> gate
 
 Pure: `step(tables, state, inputs) -> (state, outputs)`. Nothing here reads a clock, a bus or a file.
 """
@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from firmware_py.core import conditions as c
-from firmware_py.core import estimator, health, limits, manoeuvre, pid, predictor, speed, supervisor
+from firmware_py.core import estimator, health, limits, manoeuvre, paper_law, pid, predictor, speed, supervisor
 from firmware_py.core import gate as last_gate
 from firmware_py.core.motion import QUEUE_LENGTH
 from firmware_py.core.path import feedforward_at, plan_at
@@ -32,7 +32,7 @@ from firmware_py.core.signals import (
     SysCommand,
     Track,
 )
-from firmware_py.core.tables import CarTable, Tables
+from firmware_py.core.tables import LAW_CAR, LAW_PAPER, CarTable, Tables
 
 PERIOD_US = 10_000
 PERIOD_S = 0.01
@@ -54,6 +54,7 @@ class State(NamedTuple):
     estimator: estimator.EstimatorState
     speed: speed.SpeedState
     integral_m2: float
+    paper: paper_law.PaperState
     limited: int
     sent_angles_rad: tuple[float, ...]
     angle_carry_rad: float
@@ -71,6 +72,7 @@ def begin() -> State:
         estimator=estimator.begin(),
         speed=speed.begin(0.0),
         integral_m2=0.0,
+        paper=paper_law.begin(),
         limited=0,
         sent_angles_rad=(0.0,) * QUEUE_LENGTH,
         angle_carry_rad=0.0,
@@ -131,12 +133,12 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         inputs.position.position_x_m,
         inputs.position.position_y_m,
         inputs.attitude.yaw_rad,
-        car.pose_latency_samples if tables.uses_predictor != 0 else 0,
+        car.pose_latency_samples if tables.law == LAW_CAR else 0,
     )
     station_m, cross_m, heading_rad = predictor.predict(
         leg, car, estimated, state.sent_angles_rad, travel_mps, PERIOD_S
     )
-    if tables.uses_predictor == 0:
+    if tables.law != LAW_CAR:
         cross_m = estimated.cross_track_error_m
         heading_rad = estimated.heading_error_rad
 
@@ -152,6 +154,10 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     )
     wanted_rad -= estimated.road_disturbance_rad + estimated.steering_offset_rad
     wanted_rad /= estimated.steering_gain
+    paper = state.paper
+    if tables.law == LAW_PAPER:
+        pose_is_new = health_state.pose_is_new
+        paper, wanted_rad = _paper_steering(tables, state, inputs, estimated, pose_is_new, direction, travel_mps)
     if not active and not stopping_on_path:
         wanted_rad = inputs.steer.road_wheel_angle_meas_rad
     limited = limits.limit_angle(car, wanted_rad, state.sent_angles_rad[0], PERIOD_S)
@@ -187,6 +193,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         estimated,
         reference,
         integral_m2,
+        paper,
         limited.limited,
         (passed.angle_rad, *state.sent_angles_rad[:-1]),
         passed.angle_carry_rad,
@@ -207,6 +214,12 @@ def _believed(tables: Tables, state: State) -> health.Believed:
     path = state.estimator
     leg = tables.leg[manoeuvre.direction_of(state.manoeuvre.leg)]
     planned_mps, _accel_mps2 = plan_at(leg, path.station_m)
+    cross_m = path.cross_track_error_m
+    heading_rad = path.heading_error_rad
+    if tables.law == LAW_PAPER and state.manoeuvre.driving != 0:
+        # What this law keeps to its path is the centre of gravity; how the body stands to it is not its affair.
+        cross_m = state.paper.cross_track_error_m
+        heading_rad = 0.0
     return health.Believed(
         state.supervisor.mode,
         leg.sigma,
@@ -214,8 +227,8 @@ def _believed(tables: Tables, state: State) -> health.Believed:
         state.speed.stopping,
         planned_mps,
         path.station_m - leg.length_m,
-        path.cross_track_error_m,
-        path.heading_error_rad,
+        cross_m,
+        heading_rad,
         path.station_m,
         path.disbelieved,
         path.averaged,
@@ -284,6 +297,40 @@ def _steering(
     angle_rad = math.atan(reference - car.wheelbase_m * correction_1pm)
     rate_radps = travel_mps * car.wheelbase_m * slope_1pm2 / (1.0 + reference * reference)
     return angle_rad + car.steering_lag_s * rate_radps
+
+
+def _paper_steering(
+    tables: Tables,
+    state: State,
+    inputs: Inputs,
+    estimated: estimator.EstimatorState,
+    pose_is_new: int,
+    direction: int,
+    travel_mps: float,
+) -> tuple[paper_law.PaperState, float]:
+    """Return the paper's law's next state and angle: by the pose as it came, by the estimate where none did."""
+    x_m = estimated.x_m
+    y_m = estimated.y_m
+    yaw_rad = estimated.yaw_rad
+    if pose_is_new != 0:
+        x_m = inputs.position.position_x_m
+        y_m = inputs.position.position_y_m
+        yaw_rad = inputs.attitude.yaw_rad
+    return paper_law.steer(
+        tables.paper,
+        tables.reference,
+        tables.leg[direction],
+        tables.car,
+        state.paper,
+        direction,
+        travel_mps,
+        estimated.station_m,
+        x_m,
+        y_m,
+        yaw_rad,
+        inputs.steer.road_wheel_angle_meas_rad,
+        state.sent_angles_rad[0],
+    )
 
 
 def _outputs(

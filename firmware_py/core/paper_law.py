@@ -10,10 +10,12 @@ gain and pole depend on the speed; they and the PID come from tables indexed by 
 lag is in the nominal model: that is the paper's law, kept for comparison with it, not for driving.
 """
 
-from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
-from firmware_py.core.tables import Column
+from firmware_py.core.limits import limit_angle
+from firmware_py.core.path import wrap_angle
+from firmware_py.core.tables import CarTable, LegTable, PaperTable, ReferencePath
 
 PERIOD_S = 0.01
 
@@ -24,22 +26,8 @@ COLUMNS = 6
 INTEGRAL_AUTHORITY_RAD = 0.2
 """Greatest angle that the integral part may ask for."""
 
-
-class PaperTable(NamedTuple):
-    """What the law knows: `row[direction][index][column]` over `speed_grid_mps`, and Q(z).
-
-    Angles in rad, e_y in m. Q(z) = (q_b1 z + q_b2) / (z^2 + q_a1 z + q_a2). uses_pid, uses_observer: 1 or 0.
-    """
-
-    speed_grid_mps: Column
-    last_row: int
-    row: Sequence[Sequence[Column]]
-    q_b1: float
-    q_b2: float
-    q_a1: float
-    q_a2: float
-    uses_pid: int
-    uses_observer: int
+FOOT_POINT_ITERATIONS = 3
+"""From a station that is a few centimetres off: what is left after two is below a micrometre."""
 
 
 class PaperRow(NamedTuple):
@@ -53,7 +41,7 @@ class PaperRow(NamedTuple):
     inverse_pole: float
 
 
-class PaperState(NamedTuple):
+class Filters(NamedTuple):
     """What one cycle hands to the next: PID, differenced Q of e_y (two states), inverse, Q of the command (two)."""
 
     integral_ms: float
@@ -66,9 +54,77 @@ class PaperState(NamedTuple):
     command_2: float
 
 
+class PaperState(NamedTuple):
+    """The law's filters, and the true error of the centre of gravity (m, left of the body's path positive)."""
+
+    filters: Filters
+    cross_track_error_m: float
+
+
+def clear() -> Filters:
+    """Return the filters at the begin of a leg."""
+    return Filters(0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 def begin() -> PaperState:
-    """Return the state at the begin of a leg."""
-    return PaperState(0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    """Return the state at standstill."""
+    return PaperState(clear(), 0.0)
+
+
+def steer(
+    table: PaperTable,
+    reference: ReferencePath,
+    leg: LegTable,
+    car: CarTable,
+    state: PaperState,
+    direction: int,
+    travel_mps: float,
+    station_m: float,
+    x_m: float,
+    y_m: float,
+    yaw_rad: float,
+    angle_meas_rad: float,
+    sent_rad: float,
+) -> tuple[PaperState, float]:
+    """Return the next state and the wanted road-wheel angle for a pose of the rear axle, near a station.
+
+    A car that stands is at the begin of a leg: it keeps its wheels (`angle_meas_rad`). The angle keeps to the car's
+    limits from the last one sent, so that the observer knows what is really asked for.
+    """
+    if travel_mps <= 0.0:
+        return begin(), angle_meas_rad
+    ahead_x_m = x_m + reference.ahead_m * math.cos(yaw_rad)
+    ahead_y_m = y_m + reference.ahead_m * math.sin(yaw_rad)
+    cross_m, path_yaw_rad = foot_point(reference, leg, direction, station_m, ahead_x_m, ahead_y_m)
+    preview_m = row_at(table, direction, travel_mps).preview_m
+    # In travel: in reverse its left is the body's right; a heading error and a wheel turned left are the same in both.
+    error_m = leg.sigma * cross_m + preview_m * math.sin(wrap_angle(yaw_rad - path_yaw_rad))
+    filters, angle_rad = step(table, state.filters, car, direction, travel_mps, error_m, sent_rad)
+    return PaperState(filters, cross_m), angle_rad
+
+
+def foot_point(
+    reference: ReferencePath, leg: LegTable, direction: int, station_m: float, x_m: float, y_m: float
+) -> tuple[float, float]:
+    """Return how far a point is to the left of the reference's path (m), and the path's yaw there (rad)."""
+    at = station_m / leg.step_m
+    cross_m = 0.0
+    path_yaw_rad = 0.0
+    for _ in range(FOOT_POINT_ITERATIONS):
+        row = max(min(math.floor(at), leg.last_row - 1), 0)
+        b = at - row  # beyond the ends: straight on
+        a = 1.0 - b
+        xs = reference.x_m[direction]
+        ys = reference.y_m[direction]
+        dx_m = x_m - (a * xs[row] + b * xs[row + 1])
+        dy_m = y_m - (a * ys[row] + b * ys[row + 1])
+        b = max(min(b, 1.0), 0.0)
+        path_yaw_rad = (1.0 - b) * reference.yaw_rad[direction][row] + b * reference.yaw_rad[direction][row + 1]
+        c = math.cos(path_yaw_rad)
+        s = math.sin(path_yaw_rad)
+        cross_m = dy_m * c - dx_m * s
+        at += leg.sigma * (dx_m * c + dy_m * s) / leg.step_m
+    return cross_m, path_yaw_rad
 
 
 def row_at(table: PaperTable, direction: int, travel_speed_mps: float) -> PaperRow:
@@ -93,8 +149,14 @@ def row_at(table: PaperTable, direction: int, travel_speed_mps: float) -> PaperR
 
 
 def step(
-    table: PaperTable, state: PaperState, direction: int, travel_speed_mps: float, preview_error_m: float
-) -> tuple[PaperState, float]:
+    table: PaperTable,
+    state: Filters,
+    car: CarTable,
+    direction: int,
+    travel_speed_mps: float,
+    preview_error_m: float,
+    sent_rad: float,
+) -> tuple[Filters, float]:
     """Return the next state and the road-wheel angle (rad, left positive in travel) for an error (m, likewise)."""
     row = row_at(table, direction, travel_speed_mps)
     y = preview_error_m
@@ -110,7 +172,7 @@ def step(
             integral_ms = max(min(integral_ms, bound_ms), -bound_ms)
         angle_rad = -(row.kp * y + row.ki * integral_ms + row.kd * slope_mps)
     if table.uses_observer == 0:
-        return PaperState(integral_ms, y, 1, 0.0, 0.0, 0.0, 0.0, 0.0), angle_rad
+        return Filters(integral_ms, y, 1, 0.0, 0.0, 0.0, 0.0, 0.0), angle_rad
     # Differenced Q of e_y, transposed direct form II: numerator (q_b1 z + q_b2)(z - 1).
     difference = table.q_b1 * y + state.filtered_1
     filtered_1 = (table.q_b2 - table.q_b1) * y - table.q_a1 * difference + state.filtered_2
@@ -119,6 +181,7 @@ def step(
     nominal_rad = row.inverse_gain * (difference + state.inverse)
     inverse = row.inverse_pole * state.inverse + (row.inverse_pole - 1.0) * difference
     angle_rad += state.command_1 - nominal_rad
+    angle_rad = limit_angle(car, angle_rad, sent_rad, PERIOD_S).angle_rad
     command_1 = table.q_b1 * angle_rad - table.q_a1 * state.command_1 + state.command_2
     command_2 = table.q_b2 * angle_rad - table.q_a2 * state.command_1
-    return PaperState(integral_ms, y, 1, filtered_1, filtered_2, inverse, command_1, command_2), angle_rad
+    return Filters(integral_ms, y, 1, filtered_1, filtered_2, inverse, command_1, command_2), angle_rad

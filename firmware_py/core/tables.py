@@ -18,6 +18,9 @@ L_EE, L_EP, L_PE, L_PP, L_BE, L_BP, L_DR = range(5, 12)  # with the yaw rate
 M_EE, M_EP, M_PE, M_PP, M_DE, M_DP = range(12, 18)  # without it
 GAIN_COLUMNS = 18
 
+# The laws: feedback on the poses as they come; with estimator and predictor; the paper's own (`paper_law`).
+LAW_PLAIN, LAW_CAR, LAW_PAPER = range(3)
+
 
 class LegTable(NamedTuple):
     """One leg of the path and its speed profile over travelled station, on a uniform grid of `step_m`.
@@ -49,6 +52,36 @@ class GainTable(NamedTuple):
     speed_grid_mps: Column
     last_row: int
     gain: Sequence[Sequence[Column]]
+
+
+class PaperTable(NamedTuple):
+    """The paper's law: `row[direction][index][column]` over `speed_grid_mps` (columns in `paper_law`), and Q(z).
+
+    Angles in rad, e_y in m. Q(z) = (q_b1 z + q_b2) / (z^2 + q_a1 z + q_a2). uses_pid, uses_observer: 1 or 0.
+    """
+
+    speed_grid_mps: Column
+    last_row: int
+    row: Sequence[Sequence[Column]]
+    q_b1: float
+    q_b2: float
+    q_a1: float
+    q_a2: float
+    uses_pid: int
+    uses_observer: int
+
+
+class ReferencePath(NamedTuple):
+    """Where a point `ahead_m` ahead of the rear axle goes while this is on the legs: `x_m[direction][row]`.
+
+    Rows are those of the legs; yaw is that of the point's path, which the body has not: it slips there by
+    atan(ahead_m times curvature).
+    """
+
+    ahead_m: float
+    x_m: Sequence[Column]
+    y_m: Sequence[Column]
+    yaw_rad: Sequence[Column]
 
 
 class CarTable(NamedTuple):
@@ -88,7 +121,10 @@ class Timeouts(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """All that the core knows besides its state and its inputs."""
+    """All that the core knows besides its state and its inputs.
+
+    `law` is one of LAW_*; `paper` and `reference` are the paper's law's and stand empty (zeros) for the others.
+    """
 
     leg: tuple[LegTable, LegTable]
     gains: GainTable
@@ -97,4 +133,6 @@ class Tables(NamedTuple):
     dbc_hash24: int
     vehicle_hash24: int
     road_wheel_angle_lsb_rad: float
-    uses_predictor: int
+    law: int
+    paper: PaperTable
+    reference: ReferencePath

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core import paper_law
-from firmware_py.core.paper_law import PERIOD_S, PaperTable
+from firmware_py.core.paper_law import PERIOD_S
+from firmware_py.core.tables import CarTable, PaperTable
 from tools.design.waypoints import Floats
 from tools.paper.laws import BOTH, DOB, PID, Gains, Law
 from tools.paper.plant import FORWARD, REVERSE, PaperCar, Plant, matrices
@@ -20,6 +21,8 @@ POSITION_STEP_M, ANGLE_STEP_RAD = 1e-5, 1e-4
 BUS_DELAY_S = 0.0035
 """Age of a report when its command leaves, in every loop on the bus."""
 IMPOSSIBLE_RAD = 0.5 * math.pi
+UNBOUNDED = CarTable(1.0, 0.0, 1.0, 1.0, 0.0, 0, 0, 0.0, 0.0, 0.0, 1e9, 1e12, 1.0, 1.0, 1.0)
+"""A car whose steering has no limits, as in the paper: of it the law reads these two alone."""
 NAMES = {"dob": DOB, "pid": PID, "paper": BOTH}
 """The firmware's names of the paper's laws."""
 
@@ -87,14 +90,14 @@ def run(plant: Plant, law: Law, track: Track, bus: Bus) -> FirmwareRun:
     whole = math.floor(bus.delay_s / PERIOD_S + 1e-9)
     part_s = bus.delay_s - whole * PERIOD_S
     early, late = _Half(plant, part_s), _Half(plant, PERIOD_S - part_s)
-    state, x = paper_law.begin(), np.zeros(4)
+    state, x = paper_law.clear(), np.zeros(4)
     sent = [0.0] * (whole + 2)  # newest first
     e_y, steer = np.zeros(len(rho) - 1), np.zeros(len(rho) - 1)
     for k in range(len(rho) - 1):
         y = float(x[3])
         if bus.rounds:
             y = round(y / POSITION_STEP_M) * POSITION_STEP_M
-        state, angle = paper_law.step(table, state, direction, float(plan.speed_mps[k]), y)
+        state, angle = paper_law.step(table, state, UNBOUNDED, direction, float(plan.speed_mps[k]), y, 0.0)
         if bus.rounds and abs(angle) < 1e6:
             angle = round(angle / ANGLE_STEP_RAD) * ANGLE_STEP_RAD
         e_y[k], steer[k] = float(x[3]), angle
