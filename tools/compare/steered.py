@@ -123,6 +123,7 @@ def _replaced(
         after.estimator,
         after.speed,
         after.integral_m2,
+        after.paper,
         limited.limited,
         (passed.angle_rad, *before.sent_angles_rad[:-1]),
         passed.angle_carry_rad,
