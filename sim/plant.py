@@ -16,7 +16,16 @@ from sim import drive_by_wire as dbw
 from sim.actuators import SteeringParameters, SteeringState, steering_target, step_speed, step_steering
 from sim.data_files import Course, Scenario, Side, Vehicle, check_fit, true_vehicle
 from sim.sensors import Measured, SensorParameters, SensorState, measure, parameters_of
-from sim.vehicle import PlantParameters, PlantState, plant_parameters, rear_axle_of, state_at_rest, step
+from sim.vehicle import (
+    EQ11,
+    NONLINEAR,
+    PlantParameters,
+    PlantState,
+    plant_parameters,
+    rear_axle_of,
+    state_at_rest,
+    step,
+)
 
 PERIOD_NS = 10_000_000
 """Cycle of the fast reports, and the length of a sample in the vehicle file."""
@@ -181,6 +190,8 @@ def set_up(
             true.cornering_stiffness_rear_n_per_rad,
             true.tyre_friction,
             true.relaxation_length_m,
+            EQ11 if plant.model == "eq11" else NONLINEAR,
+            -1.0 if plant.reverse_sign == "printed" else 1.0,
         ),
         steering=steering,
         system=dbw.DriveByWire(timeout_ns, round(true.gear_change_s * dbw.NS)),

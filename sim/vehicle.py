@@ -1,4 +1,4 @@
-"""The car's body on its tyres: nonlinear single-track model in the body frame.
+"""The car's body on its tyres: nonlinear single-track model in the body frame; beside it, eq. 11 of the paper.
 
 Axes and signs as ISO 8855: x ahead, y left, yaw and road-wheel angle positive to the left. Reverse is a negative
 longitudinal velocity, not another model. The longitudinal velocity is given by drive and brake (`sim.actuators`);
@@ -19,8 +19,19 @@ from sim.tyre import CARCASS_DAMPING_RATIO, brush_factor
 GRAVITY_MPS2 = 9.81
 
 
+# Models of the body's lateral motion.
+NONLINEAR, EQ11 = range(2)
+
+LEAST_SPEED_MPS = 0.1
+"""Eq. 11 divides by the speed; below this it is taken at this speed (Table 3's least)."""
+
+
 class PlantParameters(NamedTuple):
-    """Constants of the single-track model (SI units); damping in N s/m of lateral tyre deflection, per axle."""
+    """Constants of the single-track model (SI units); damping in N s/m of lateral tyre deflection, per axle.
+
+    `model` is NONLINEAR or EQ11; `reverse_moment` is the sign of the front wheels' yaw moment in reverse with EQ11,
+    +1 as it is, -1 as the paper prints it.
+    """
 
     mass_kg: float
     yaw_inertia_kgm2: float
@@ -33,6 +44,8 @@ class PlantParameters(NamedTuple):
     relaxation_length_m: float
     damping_front: float
     damping_rear: float
+    model: int
+    reverse_moment: float
 
 
 class PlantState(NamedTuple):
@@ -61,6 +74,8 @@ def plant_parameters(
     cornering_stiffness_rear_n_per_rad: float,
     tyre_friction: float,
     relaxation_length_m: float,
+    model: int = NONLINEAR,
+    reverse_moment: float = 1.0,
 ) -> PlantParameters:
     """Constants of the model from those of a vehicle file; stiffnesses are per axle."""
     front, rear = wheelbase_m - cg_to_rear_axle_m, cg_to_rear_axle_m
@@ -81,6 +96,8 @@ def plant_parameters(
         relaxation_length_m=relaxation_length_m,
         damping_front=damping(cornering_stiffness_front_n_per_rad, mass_front),
         damping_rear=damping(cornering_stiffness_rear_n_per_rad, mass_rear),
+        model=model,
+        reverse_moment=reverse_moment,
     )
 
 
@@ -108,7 +125,9 @@ def step(p: PlantParameters, s: PlantState, speed_next: float, road_wheel_angle:
         if lateral == 0.0 and yaw_rate == 0.0 and accel == 0.0:
             return s
         return PlantState(x, y, yaw, 0.0, 0.0, 0.0, slip_front, slip_rear, 0.0)
-    mass, inertia, lf, lr, stiffness_f, stiffness_r, friction_f, friction_r, relaxation, damping_f, damping_r = p
+    if p.model == EQ11:
+        return step_eq11(p, s, speed_next, road_wheel_angle, h)
+    mass, inertia, lf, lr, stiffness_f, stiffness_r, friction_f, friction_r, relaxation, damping_f, damping_r, _, _ = p
     c = cos(road_wheel_angle)
     w = sin(road_wheel_angle)
 
@@ -167,5 +186,51 @@ def step(p: PlantParameters, s: PlantState, speed_next: float, road_wheel_angle:
         yaw_rate_next,
         keep_f + take_f * front,
         keep_r + take_r * rear,
+        accel,
+    )
+
+
+def step_eq11(p: PlantParameters, s: PlantState, speed_next: float, road_wheel_angle: float, h: float) -> PlantState:
+    """State after `h` seconds by eq. 11 of the paper: linear tyres without relaxation, small angles, implicit.
+
+    Eq. 11's (beta, r) in the body frame with signed speed, beta = lateral velocity / speed; the pose is integrated
+    exactly. In reverse the paper prints the steered wheels' yaw moment with the other sign (`reverse_moment` -1).
+    """
+    size = abs(speed_next)
+    size = max(size, LEAST_SPEED_MPS)
+    lf = p.cg_to_front_axle_m
+    lr = p.cg_to_rear_axle_m
+    drag_f = p.stiffness_front_n_per_rad / size
+    drag_r = p.stiffness_rear_n_per_rad / size
+    steered = speed_next * drag_f * road_wheel_angle  # force of the steered wheels in the direction of no slip
+    turning = lf * steered
+    if speed_next < 0.0:
+        turning *= p.reverse_moment
+    moment = lr * drag_r - lf * drag_f
+    a11 = p.mass_kg / h + drag_f + drag_r
+    a12 = p.mass_kg * speed_next - moment
+    a22 = p.yaw_inertia_kgm2 / h + lf * lf * drag_f + lr * lr * drag_r
+    b1 = p.mass_kg / h * s.lateral_velocity_mps + steered
+    b2 = p.yaw_inertia_kgm2 / h * s.yaw_rate_radps + turning
+    inverse = 1.0 / (a11 * a22 + a12 * moment)
+    lateral_next = (b1 * a22 - a12 * b2) * inverse
+    yaw_rate_next = (a11 * b2 + b1 * moment) * inverse
+    accel = (lateral_next - s.lateral_velocity_mps) / h + speed_next * yaw_rate_next
+
+    yaw_next = s.yaw_rad + 0.5 * h * (s.yaw_rate_radps + yaw_rate_next)
+    middle = 0.5 * (s.yaw_rad + yaw_next)
+    cm = cos(middle)
+    sm = sin(middle)
+    ahead = 0.5 * h * (s.speed_mps + speed_next)
+    aside = 0.5 * h * (s.lateral_velocity_mps + lateral_next)
+    return PlantState(
+        s.x_m + ahead * cm - aside * sm,
+        s.y_m + ahead * sm + aside * cm,
+        yaw_next,
+        speed_next,
+        lateral_next,
+        yaw_rate_next,
+        s.slip_front_rad,
+        s.slip_rear_rad,
         accel,
     )

@@ -94,8 +94,32 @@ def _shipped(options: argparse.Namespace) -> int:
         else:
             print(f"{folder.name}: fresh, and the same when made again")
         all_figures.append(tables.as_json(report, None))
+    if options.vehicle in (None, "paper") and options.course in (None, "paper"):
+        status = max(status, _paper_study(options.update))
     _write_json(options.json, {"designs": all_figures})
     return status
+
+
+def _paper_study(update: bool) -> int:
+    """Write or check the tables of the paper's own manoeuvre."""
+    from tools.design import tables  # noqa: PLC0415 -- scipy
+    from tools.paper import firmware_tables  # noqa: PLC0415
+
+    vehicle, course = firmware_tables.study_pair()
+    folder = firmware_tables.study_folder()
+    report = firmware_tables.study_report(vehicle, course)
+    if update:
+        tables.write_tables(report, folder)
+        print(f"tables written to {folder}")
+        return DONE
+    found = [f"stale: {what} has changed since" for what in tables.stale_inputs(folder, vehicle, course)]
+    found += tables.differences(tables.table_texts(report), folder)
+    for line in found:
+        print(f"{folder.name}: {line}")
+    print(
+        f"{folder.name}: {'differs; run `parkctl design --update`' if found else 'fresh, and the same when made again'}"
+    )
+    return DIFFERENT if found else DONE
 
 
 def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | None = None) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import random
 from collections.abc import Callable
 from math import cos, sin
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 
@@ -47,16 +47,20 @@ _AnyDraw = Annotated[Draw, BeforeValidator(_to_draw)]
 
 
 class PlantDeviation(BaseModel):
-    """How the car differs from what the tables were made for.
+    """What the car is made of, and how it differs from what the tables were made for.
 
-    steering_gain: road-wheel angle over command; steering_bias_rad: added at the road wheel, not seen by the steering
-    sensor; steering_backlash_rad: whole width of the play between rack and road wheel; steering_command_resolution_rad:
-    step of the actuator's converter, 0 = none; longitudinal_latency_samples: dead time of speed and brake commands in
-    samples of 10 ms; unknown: vehicle parameters that the true car has instead of the file's nominal ones; corners:
-    vehicle parameters that lie at either end of nominal * (1 -/+ spread), one bit of the seed each, lowest bit first.
+    model: "nonlinear" single-track, or "eq11", the paper's linear one, whose reverse is "corrected" or has the
+    "printed" sign of the steered wheels' yaw moment. steering_gain: road-wheel angle over command; steering_bias_rad:
+    added at the road wheel, not seen by the steering sensor; steering_backlash_rad: whole width of the play between
+    rack and road wheel; steering_command_resolution_rad: step of the actuator's converter, 0 = none;
+    longitudinal_latency_samples: dead time of speed and brake commands in samples of 10 ms; unknown: vehicle parameters
+    that the true car has instead of the file's nominal ones; corners: vehicle parameters that lie at either end of
+    nominal * (1 -/+ spread), one bit of the seed each, lowest bit first.
     """
 
     model_config = STRICT
+    model: Literal["nonlinear", "eq11"] = "nonlinear"
+    reverse_sign: Literal["corrected", "printed"] = "corrected"
     steering_gain: Annotated[_AnyDraw, AfterValidator(_within(0.5, 1.5))] = (1.0, 1.0)
     steering_bias_rad: Annotated[_AnyDraw, AfterValidator(_within(-0.2, 0.2))] = (0.0, 0.0)
     steering_backlash_rad: Annotated[_AnyDraw, AfterValidator(_within(0.0, 0.2))] = (0.0, 0.0)
@@ -107,13 +111,15 @@ class StartOffset(BaseModel):
 class Scenario(BaseModel):
     """How the world differs from the drawing board.
 
-    `vehicle_overlay` holds nominal vehicle parameters of this scenario: tables are made from them too, and the
-    vehicle hash on the bus covers them. All else is unknown to the controller.
+    `course` is the course that it is meant for, taken where none is named. `vehicle_overlay` holds nominal vehicle
+    parameters of this scenario: tables are made from them too, and the vehicle hash on the bus covers them. All else is
+    unknown to the controller.
     """
 
     model_config = STRICT
     name: Name
     description: Text
+    course: Name | None = None
     vehicle_overlay: dict[str, Finite] = {}
     plant: PlantDeviation = PlantDeviation()
     sensors: Sensors = Sensors()
@@ -125,6 +131,10 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     """Read and check a scenario file."""
     path = find_file("scenario", name_or_path)
     scenario = validate(path, Scenario, read_toml(path)[1])
+    if scenario.plant.reverse_sign != "corrected" and scenario.plant.model != "eq11":
+        raise UserError(
+            f'{path}: plant.reverse_sign = {scenario.plant.reverse_sign!r}: is for plant.model = "eq11" only'
+        )
     check_parameters(scenario.vehicle_overlay, f"{path}: vehicle_overlay.")
     for low_or_high in (0, 1):
         check_parameters({k: v[low_or_high] for k, v in scenario.plant.unknown.items()}, f"{path}: plant.unknown.")

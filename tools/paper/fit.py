@@ -19,7 +19,7 @@ from sim.errors import UserError
 from tools.design.waypoints import Floats, Waypoints, check_waypoints, interpolate
 from tools.paper.laws import DOB, PID, Gains, Law
 from tools.paper.path_study import FOOT_M, VARIANTS, PathResult, fitted
-from tools.paper.plant import FORWARD, REVERSE, TABLE_4, Plant
+from tools.paper.plant import FORWARD, REVERSE, TABLE_4, PaperCar, Plant
 from tools.paper.printed import TABLES_5_6
 from tools.paper.simulate import Figures, Steps, figures_of, simulate
 from tools.paper.speed import TABLE_3, motion
@@ -55,6 +55,12 @@ class StoredFit(NamedTuple):
     waypoints: Waypoints
     gains: Gains
     provenance: dict[str, str | float | int]
+
+
+def gains_for(car: PaperCar, stored: StoredFit) -> Gains:
+    """The fitted gains, scaled with the wheelbase, so that the loop in terms of curvature is the same for every car."""
+    scale = car.wheelbase_m / TABLE_4.wheelbase_m
+    return Gains(*(scale * gain for gain in stored.gains))
 
 
 def waypoints_of(numbers_ft: Floats) -> Waypoints:

@@ -12,11 +12,11 @@ from tools.design.path import Path
 from tools.design.waypoints import Floats
 from tools.paper import firmware_law, path_study, rear_axle
 from tools.paper.firmware_law import FirmwareRun
-from tools.paper.fit import StoredFit
+from tools.paper.fit import StoredFit, gains_for
 from tools.paper.laws import BOTH, DOB, LAWS, Gains, Law, Observer
 from tools.paper.path_study import AS_PRINTED, VARIANTS, Choice, PathResult
 from tools.paper.plant import CORRECTED as CORRECTED_SIGN
-from tools.paper.plant import FORWARD, PRINTED, REVERSE, TABLE_4, PaperCar, Plant, car_of
+from tools.paper.plant import FORWARD, PRINTED, REVERSE, PaperCar, Plant, car_of
 from tools.paper.rates import Rates, study_rates
 from tools.paper.rear_axle import RearAxleRun
 from tools.paper.simulate import STEP_S, Figures, Run, Steps, figures_of, simulate
@@ -79,12 +79,6 @@ class Study(NamedTuple):
     convergence: dict[float, Figures]
     firmware: list[FirmwareRun]
     observers: dict[Observer, Figures]
-
-
-def gains_for(car: PaperCar, stored: StoredFit) -> Gains:
-    """The fitted gains, scaled with the wheelbase, so that the loop in terms of curvature is the same for every car."""
-    scale = car.wheelbase_m / TABLE_4.wheelbase_m
-    return Gains(*(scale * gain for gain in stored.gains))
 
 
 def compute(vehicle: Vehicle, course: Course, stored: StoredFit, tell: Callable[[str], None]) -> Study:
