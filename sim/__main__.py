@@ -63,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     bus.add_argument("--no-config", action="store_true", help="ignore CAN_* variables and can.conf; always so here")
     what = parser.add_argument_group("what is emulated (NAME of a shipped file or path of a FILE)")
     what.add_argument("--vehicle", default="paper", metavar="NAME|FILE", help="the car (default: paper)")
-    what.add_argument("--course", default="ohio", metavar="NAME|FILE", help="cones, start, stop (default: ohio)")
+    what.add_argument("--course", metavar="NAME|FILE", help="cones, start, stop (default: the scenario's, else ohio)")
     what.add_argument("--scenario", default="car", metavar="NAME|FILE", help="what is not ideal (default: car)")
     what.add_argument("--side", choices=("left", "right"), default="left", help="side to pass the point cone on")
     what.add_argument("--seed", type=int, default=1, metavar="N", help="decides every random draw (default: 1)")
@@ -105,8 +105,8 @@ def _run(options: argparse.Namespace) -> int:
         raise UserError(f"--duration {options.duration:g}: must be more than 0")
     if not 1 <= options.slow_motion <= SLOWEST_MOTION:
         raise UserError(f"--slow-motion {options.slow_motion}: must be from 1 to {SLOWEST_MOTION}")
-    vehicle, course = load_vehicle(options.vehicle), load_course(options.course)
-    scenario = load_scenario(options.scenario)
+    vehicle, scenario = load_vehicle(options.vehicle), load_scenario(options.scenario)
+    course = load_course(options.course or scenario.course or "ohio")
     phase_ns = round(options.phase_ms * 1e6)
 
     def make(start_ns: int) -> Emulator:

@@ -31,7 +31,8 @@ EXIT_INTERRUPTED = 130
 LISTEN_S = 0.25
 """A bus is listened to for so long before it is used: twice the longest timeout of a fast message."""
 DBC = Path(__file__).resolve().parent.parent / "dbc" / "parking.dbc"
-LAWS = ("car", "pid+ff")
+DEFAULT_COURSE = "ohio"
+LAWS = ("car", "pid+ff", "paper", "dob", "pid")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     what = parser.add_argument_group("what is driven (a NAME of a shipped file, or the path of a .toml FILE)")
     what.add_argument("--vehicle", default="paper", metavar="NAME|FILE", help="the car (default: paper)")
-    what.add_argument("--course", default="ohio", metavar="NAME|FILE", help="cones, start and stop (default: ohio)")
+    what.add_argument(
+        "--course", metavar="NAME|FILE", help="cones, start and stop (default: the scenario's own, else ohio)"
+    )
     what.add_argument("--side", choices=("left", "right"), default="left", help="where to pass the point cone (left)")
     what.add_argument(
         "--scenario",
@@ -51,7 +54,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE",
         help="how car and sensors differ from the ideal (default: car)",
     )
-    what.add_argument("--law", choices=LAWS, default="car", help="control law (default: car)")
+    what.add_argument(
+        "--law", choices=LAWS, default="car",
+        help="control law (default: car); paper, dob and pid are the paper's own, which no car can be reversed by",
+    )  # fmt: skip
     what.add_argument(
         "--seed", type=int, default=1, metavar="N", help="decides noise and unknown parameters (default: 1)"
     )
@@ -141,7 +147,8 @@ def _plan(args: argparse.Namespace) -> Plan:
         raise UserError("--lockstep: runs in one process without a bus; leave out -i, -c and -b")
     scenario = load_scenario(args.scenario)
     vehicle = load_vehicle(args.vehicle, scenario.vehicle_overlay)
-    course = load_course(args.course)
+    course_name = args.course or scenario.course or DEFAULT_COURSE
+    course = load_course(course_name)
     check_fit(vehicle, course)
     return Plan(
         vehicle=vehicle,
@@ -153,7 +160,7 @@ def _plan(args: argparse.Namespace) -> Plan:
         lockstep=args.lockstep,
         realtime=args.realtime,
         bus=bus,
-        named={"vehicle": args.vehicle, "course": args.course, "scenario": args.scenario},
+        named={"vehicle": args.vehicle, "course": course_name, "scenario": args.scenario},
     )
 
 

@@ -217,9 +217,9 @@ def _believed(tables: Tables, state: State) -> health.Believed:
     cross_m = path.cross_track_error_m
     heading_rad = path.heading_error_rad
     if tables.law == LAW_PAPER and state.manoeuvre.driving != 0:
-        # What this law keeps to its path is the centre of gravity; how the body stands to it is not its affair.
+        # What this law keeps to its path is the centre of gravity.
         cross_m = state.paper.cross_track_error_m
-        heading_rad = 0.0
+        heading_rad = state.paper.heading_error_rad
     return health.Believed(
         state.supervisor.mode,
         leg.sigma,

@@ -55,10 +55,14 @@ class Filters(NamedTuple):
 
 
 class PaperState(NamedTuple):
-    """The law's filters, and the true error of the centre of gravity (m, left of the body's path positive)."""
+    """The law's filters; the true errors, ISO 8855: of the centre of gravity (m), and of the body's heading (rad).
+
+    The heading error is what is left of it beyond the side slip that a centre of gravity on the path has.
+    """
 
     filters: Filters
     cross_track_error_m: float
+    heading_error_rad: float
 
 
 def clear() -> Filters:
@@ -68,7 +72,7 @@ def clear() -> Filters:
 
 def begin() -> PaperState:
     """Return the state at standstill."""
-    return PaperState(clear(), 0.0)
+    return PaperState(clear(), 0.0, 0.0)
 
 
 def steer(
@@ -95,21 +99,28 @@ def steer(
         return begin(), angle_meas_rad
     ahead_x_m = x_m + reference.ahead_m * math.cos(yaw_rad)
     ahead_y_m = y_m + reference.ahead_m * math.sin(yaw_rad)
-    cross_m, path_yaw_rad = foot_point(reference, leg, direction, station_m, ahead_x_m, ahead_y_m)
+    cross_m, path_yaw_rad, slip_rad = foot_point(reference, leg, direction, station_m, ahead_x_m, ahead_y_m)
     preview_m = row_at(table, direction, travel_mps).preview_m
     # In travel: in reverse its left is the body's right; a heading error and a wheel turned left are the same in both.
-    error_m = leg.sigma * cross_m + preview_m * math.sin(wrap_angle(yaw_rad - path_yaw_rad))
+    heading_rad = wrap_angle(yaw_rad - path_yaw_rad)
+    error_m = leg.sigma * cross_m + preview_m * math.sin(heading_rad)
     filters, angle_rad = step(table, state.filters, car, direction, travel_mps, error_m, sent_rad)
-    return PaperState(filters, cross_m), angle_rad
+    # Either way: in reverse with the sign that the paper prints the body slips to the other side.
+    heading_rad -= max(min(heading_rad, abs(slip_rad)), -abs(slip_rad))
+    return PaperState(filters, cross_m, heading_rad), angle_rad
 
 
 def foot_point(
     reference: ReferencePath, leg: LegTable, direction: int, station_m: float, x_m: float, y_m: float
-) -> tuple[float, float]:
-    """Return how far a point is to the left of the reference's path (m), and the path's yaw there (rad)."""
+) -> tuple[float, float, float]:
+    """Return how far a point is to the left of the reference's path (m), and the path's yaw and side slip there (rad).
+
+    The side slip is the angle by which the body's yaw on the leg is less.
+    """
     at = station_m / leg.step_m
     cross_m = 0.0
     path_yaw_rad = 0.0
+    slip_rad = 0.0
     for _ in range(FOOT_POINT_ITERATIONS):
         row = max(min(math.floor(at), leg.last_row - 1), 0)
         b = at - row  # beyond the ends: straight on
@@ -120,11 +131,12 @@ def foot_point(
         dy_m = y_m - (a * ys[row] + b * ys[row + 1])
         b = max(min(b, 1.0), 0.0)
         path_yaw_rad = (1.0 - b) * reference.yaw_rad[direction][row] + b * reference.yaw_rad[direction][row + 1]
+        slip_rad = path_yaw_rad - (1.0 - b) * leg.yaw_rad[row] - b * leg.yaw_rad[row + 1]
         c = math.cos(path_yaw_rad)
         s = math.sin(path_yaw_rad)
         cross_m = dy_m * c - dx_m * s
         at += leg.sigma * (dx_m * c + dy_m * s) / leg.step_m
-    return cross_m, path_yaw_rad
+    return cross_m, path_yaw_rad, slip_rad
 
 
 def row_at(table: PaperTable, direction: int, travel_speed_mps: float) -> PaperRow:
