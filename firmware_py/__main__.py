@@ -60,6 +60,9 @@ def build_parser() -> argparse.ArgumentParser:
         choices=("auto", "off", "required"),
         help="use of SCHED_FIFO (required on a physical interface, auto on loopbus, virtual and vcan*)",
     )
+    parser.add_argument(
+        "--no-rehearsal", action="store_true", help="do not run each cycle's work once before its time (SCHED_FIFO)"
+    )
     parser.add_argument("--cpu", type=int, metavar="N", help="stay on this CPU")
     parser.add_argument(
         "--slow-motion", type=int, default=1, metavar="N",
@@ -129,8 +132,16 @@ def _run(options: argparse.Namespace) -> int:
         rates = RateWatch(codec.messages, PERIOD_US // 1000)
         status_fd = status_writer(options.status)
         clock = Clock(options.slow_motion)
-        loop = Loop(node, bus, rates, realtime=outcome, once=options.once, status_fd=status_fd, clock=clock)
-        result = loop.run()
+        result = Loop(
+            node,
+            bus,
+            rates,
+            realtime=outcome,
+            once=options.once,
+            status_fd=status_fd,
+            clock=clock,
+            rehearses=not options.no_rehearsal,
+        ).run()
     finally:
         bus.close()
     if options.out is not None:

@@ -1,6 +1,7 @@
 """The controller as a node of the bus: frames in, one cycle of the core, frames out. Reads no clock."""
 
-from typing import NamedTuple
+import contextlib
+from typing import Any, NamedTuple
 
 from firmware_py.codec import Codec, Mailbox, Sender
 from firmware_py.core import conditions as c
@@ -88,6 +89,8 @@ class ControllerNode:
         self._sender = Sender(codec)
         self._tables = tables
         self._state = controller.begin()
+        self._frames: list[Frame] = []
+        self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
         self._cycle_index = 0
         self._every = {
@@ -107,21 +110,14 @@ class ControllerNode:
         if self.stop_requested:
             inputs = inputs._replace(oper=inputs.oper._replace(oper_stop=1))
         outputs = self._step(inputs)
-        self._outputs = outputs
+        self._frames, self._inputs, self._outputs = frames, inputs, outputs
         self.cycles += 1
         self.overruns += overruns
         self._cycle_index = (self._cycle_index + 1 + overruns) % CYCLE_INDEX_VALUES
         self.record.append(inputs, outputs)
 
         pack = self._sender.pack
-        out = [
-            pack("CTRL_SteerCmd", outputs.steer),
-            pack("CTRL_LongCmd", outputs.long),
-            pack("CTRL_SysCmd", outputs.sys),
-            pack("CTRL_Cycle", CycleStamp(self._cycle_index, inputs.now_us % WAKE_TIME_VALUES)),
-            pack("CTRL_CycleInputs", inputs.used),
-            pack("CTRL_Track", outputs.track),
-        ]
+        out = [pack(name, values) for name, values in self._messages(inputs, outputs)]
         if self.cycles % self._every["CTRL_Version"] == 1:
             out.append(pack("CTRL_Version", self._version))
         if self.cycles % self._every["CTRL_HealthTiming"] == 0:
@@ -130,6 +126,29 @@ class ControllerNode:
             out.append(pack("CTRL_HealthCounts", self.health.counts(self.mailbox, self.overruns, send_failed)))
         self.frames_sent += len(out)
         return out
+
+    def rehearse(self) -> None:
+        """Run the work of a cycle on the newest frames and inputs and forget the result; changes nothing, never raises.
+
+        The core is pure, and so are the codec's generated functions: code and tables are in the caches afterwards.
+        """
+        if self._inputs is None or self._outputs is None:
+            return
+        with contextlib.suppress(Exception):
+            self.mailbox.rehearse(self._frames)
+            controller.step(self._tables, self._state, self._inputs)
+            self._sender.rehearse(self._messages(self._inputs, self._outputs))
+
+    def _messages(self, inputs: Inputs, outputs: Outputs) -> list[tuple[str, tuple[Any, ...]]]:
+        """Return what every cycle sends: names and values."""
+        return [
+            ("CTRL_SteerCmd", outputs.steer),
+            ("CTRL_LongCmd", outputs.long),
+            ("CTRL_SysCmd", outputs.sys),
+            ("CTRL_Cycle", CycleStamp(self._cycle_index, inputs.now_us % WAKE_TIME_VALUES)),
+            ("CTRL_CycleInputs", inputs.used),
+            ("CTRL_Track", outputs.track),
+        ]
 
     def seen(self) -> Seen:
         """Return mode, leg, reason and place as the newest cycle left them."""

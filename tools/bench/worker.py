@@ -1,8 +1,9 @@
 """Process of its own that measures the tick and the codec: `python -m tools.bench.worker`.
 
 Reads one JSON object a line from standard input, `{"do": NAME, "samples": N}`, answers with one line each, and ends
-with its input. Tick: the plain cycle, the same source compiled, and an empty call take turns, one sample each. Codec:
-the controller's own, cantools, and a raw UDP socket on the loopback take turns in the same way.
+with its input. Tick: the plain cycle as the loop runs it, the same without rehearsal, the same source compiled, and an
+empty call take turns, one sample each. Codec: the controller's own, cantools, and a raw UDP socket on the loopback take
+turns in the same way.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ import numpy as np
 
 from firmware_py.codec import Codec, Sender
 from firmware_py.core import controller
+from firmware_py.loop import PERIOD_NS, SPIN_NS, Clock, Pace
 from firmware_py.realtime import set_up
 from tools.bench.compiled_tick import Entry, arrays_of, compile_entry
 from tools.bench.recording import Recording, record
 from tools.lockstep import DBC
 
-PERIOD_NS = 10_000_000
 MESSAGE = "CTRL_SteerCmd"
 
 Samples = dict[str, list[int]]
@@ -59,38 +60,73 @@ class Ticks:
             differing += not same
         return differing
 
-    def measure(self, samples: int, *, cold: bool) -> Samples:
-        """Return durations in ns; where `cold`, every sample has slept for its own 10 ms before."""
+    def cold(self, samples: int, *, fifo: bool) -> Samples:
+        """Return durations in ns, each sample after a sleep of its own to a multiple of 10 ms.
+
+        `looped`: the plain cycle as the loop runs it, which waits by the loop's own `Pace` and, where it has `fifo`,
+        rehearses on the inputs of the cycle before; `rehearsal` is what it rehearsed before each sample. `plain` and
+        `compiled` come straight from their sleep.
+        """
         recording, entry, columns, output = self._recording, self._entry, self._columns, self._output
-        step, tables = controller.step, recording.tables
-        clock = time.perf_counter_ns
-        plain, compiled, empty = [], [], []
-        rest = _Rest() if cold else _empty
-        first = recording.active[0]
-        state, array = recording.states[first], self._states[first].copy()
-        for cycle in (recording.active * (samples // len(recording.active) + 1))[:samples]:
-            if cycle == first:
-                state, array = recording.states[first], self._states[first].copy()
-            inputs, row = recording.inputs[cycle], self._inputs[cycle]
-            rest()
+        step, tables, clock = controller.step, recording.tables, time.perf_counter_ns
+        durations: Samples = {"looped": [], "plain": [], "compiled": [], "rehearsal": []}
+        array = self._states[0].copy()
+        cycle = recording.active[0]
+
+        def rehearse() -> None:
             begun = clock()
-            state, _ = step(tables, state, inputs)
-            plain.append(clock() - begun)
-            rest()
+            step(tables, recording.states[cycle], recording.inputs[cycle - 1])
+            durations["rehearsal"][-1] += clock() - begun
+
+        sleeping = Pace(Clock())
+        looping = Pace(Clock(), SPIN_NS, rehearse) if fifo else sleeping
+        for cycle in _evenly(recording.active, samples):
+            state, inputs, row = recording.states[cycle], recording.inputs[cycle], self._inputs[cycle]
+            array[:] = self._states[cycle]
+            durations["rehearsal"].append(0)
+            looping.wait_until(_next_deadline_ns())
+            begun = clock()
+            step(tables, state, inputs)
+            durations["looped"].append(clock() - begun)
+            sleeping.wait_until(_next_deadline_ns())
+            begun = clock()
+            step(tables, state, inputs)
+            durations["plain"].append(clock() - begun)
+            sleeping.wait_until(_next_deadline_ns())
             begun = clock()
             entry(columns, array, row, output)
-            compiled.append(clock() - begun)
+            durations["compiled"].append(clock() - begun)
+        return durations
+
+    def hot(self, samples: int) -> Samples:
+        """Return durations in ns of samples without a pause between them."""
+        recording, entry, columns, output = self._recording, self._entry, self._columns, self._output
+        step, tables, clock = controller.step, recording.tables, time.perf_counter_ns
+        durations: Samples = {"plain": [], "compiled": [], "empty": []}
+        array = self._states[0].copy()
+        for cycle in _evenly(recording.active, samples):
+            state, inputs, row = recording.states[cycle], recording.inputs[cycle], self._inputs[cycle]
+            array[:] = self._states[cycle]
+            begun = clock()
+            step(tables, state, inputs)
+            durations["plain"].append(clock() - begun)
+            begun = clock()
+            entry(columns, array, row, output)
+            durations["compiled"].append(clock() - begun)
             begun = clock()
             _empty()
-            empty.append(clock() - begun)
-        return {"plain": plain, "compiled": compiled, "empty": empty}
+            durations["empty"].append(clock() - begun)
+        return durations
 
 
-class _Rest:
-    """Sleep to the next multiple of the period."""
+def _evenly(cycles: list[int], count: int) -> list[int]:
+    """Return so many of the cycles from all over the manoeuvre, in their order."""
+    return [cycles[index * len(cycles) // count] for index in range(count)]
 
-    def __call__(self) -> None:
-        time.sleep((PERIOD_NS - time.monotonic_ns() % PERIOD_NS) * 1e-9)
+
+def _next_deadline_ns() -> int:
+    """Return the next multiple of the period."""
+    return (time.monotonic_ns() // PERIOD_NS + 1) * PERIOD_NS
 
 
 class Codecs:
@@ -164,7 +200,11 @@ def main() -> None:
         if order["do"] == "codec":
             answer = codecs.measure(order["samples"])
         else:
-            answer = ticks.measure(order["samples"], cold=order["do"] == "tick_cold")
+            answer = (
+                ticks.cold(order["samples"], fifo=outcome.fifo)
+                if order["do"] == "tick_cold"
+                else ticks.hot(order["samples"])
+            )
         print(json.dumps(answer), flush=True)
         gc.collect()
 
