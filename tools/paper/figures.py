@@ -36,6 +36,7 @@ def catalogue(study: Study, loops: Loops) -> dict[str, Callable[[Path], None]]:
         "feedforward": lambda stem: paper_runs.feedforward(study, stem),
         "divergence": lambda stem: paper_runs.divergence(study, stem),
         "rear_axle_law": lambda stem: paper_runs.rear_axle_law(study, stem),
+        "in_controller": lambda stem: paper_runs.in_controller(study, stem),
         "rates": lambda stem: paper_runs.rates(study, stem),
     }
     if study.car.is_papers:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tools.paper import figures, html, page_loop, page_path, page_runs
+from tools.paper import figures, html, page_live, page_loop, page_path, page_runs
 from tools.paper.loops import Loops
 from tools.paper.study import Study
 from tools.run_folder import write_whole
@@ -36,6 +36,7 @@ def write(folder: Path, study: Study, loops: Loops, content: dict[str, Any], tel
         ("pid", "Parameter space: eq. 19, Figures 11 to 13", page_loop.parameter_space(study, loops, picture)),
         ("runs", "Simulations: Tables 4 to 6, Figures 14 to 19", page_runs.simulations(study, content, picture)),
         ("reverse", "Reverse with the sign put right", page_runs.reverse(study, content, picture)),
+        ("controller", "The laws in the controller: Tables 5 and 6 at 100 Hz", page_live.controller(study, picture)),
         ("method", "How this was computed", page_runs.method(study, content)),
     ]
     write_whole(folder / PAGE, html.page("The paper, reproduced and corrected", lead, sections))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from tools.paper.firmware_law import FirmwareRun
 from tools.paper.html import OURS, SAYS, SO, WRONG, equation, note, number, table
+from tools.paper.in_lockstep import LegRow
 from tools.paper.laws import BOTH, DOB, PID
 from tools.paper.loops import Loops
 from tools.paper.plant import FORWARD, REVERSE
@@ -187,8 +188,8 @@ def _firmware(study: Study) -> str:
             for bus in buses:
                 run = runs[(law, direction, bus)]
                 unstable = f"!unstable after {run.travelled_m:.1f} m"
-                cells.append(unstable if run.max_e_y_m == float("inf") else _three(run))
-            rows.append((f"{law}, {direction}", _three(continuous), *cells))
+                cells.append(unstable if run.max_e_y_m == float("inf") else three(run))
+            rows.append((f"{law}, {direction}", three(continuous), *cells))
     return "".join(
         [
             table(
@@ -209,7 +210,8 @@ def _firmware(study: Study) -> str:
     )
 
 
-def _three(found: Figures | FirmwareRun) -> str:
+def three(found: Figures | FirmwareRun | LegRow) -> str:
+    """Max and rms e_y in mm and the angle in rad, in a cell."""
     return f"{1e3 * found.max_e_y_m:.3g} / {1e3 * found.rms_e_y_m:.3g} / {found.max_steer_rad:.3f}"
 
 

@@ -10,9 +10,10 @@ from sim.body import Outline, clearance_array_m, outline_of
 from sim.data_files import Course, Vehicle
 from tools.design.path import Path
 from tools.design.waypoints import Floats
-from tools.paper import firmware_law, path_study, rear_axle
+from tools.paper import firmware_law, in_lockstep, path_study, rear_axle
 from tools.paper.firmware_law import FirmwareRun
 from tools.paper.fit import StoredFit, gains_for
+from tools.paper.in_lockstep import LegRun
 from tools.paper.laws import BOTH, DOB, LAWS, Gains, Law, Observer
 from tools.paper.path_study import AS_PRINTED, VARIANTS, Choice, PathResult
 from tools.paper.plant import CORRECTED as CORRECTED_SIGN
@@ -78,6 +79,7 @@ class Study(NamedTuple):
     rates: Rates
     convergence: dict[float, Figures]
     firmware: list[FirmwareRun]
+    lockstep: list[LegRun]
     observers: dict[Observer, Figures]
 
 
@@ -116,7 +118,7 @@ def compute(vehicle: Vehicle, course: Course, stored: StoredFit, tell: Callable[
         path_study.sweep(stored.waypoints, VARIANTS[0]), path_study.sweep(stored.waypoints, VARIANTS[-1]),
         tracks, motions, results, leaving, room_m, rear_path, rear_runs, study_rates(car, gains, paths),
         convergence(car, gains, tracks[FORWARD]), firmware_law.study(car, gains, tracks),
-        observer_choices(car, gains, tracks[FORWARD]),
+        in_lockstep.study(vehicle, course, stored, tracks, tell), observer_choices(car, gains, tracks[FORWARD]),
     )  # fmt: skip
 
 

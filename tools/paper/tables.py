@@ -3,9 +3,11 @@
 from math import isinf
 from typing import Any, NamedTuple
 
+from tools.paper.firmware_law import NAMES
+from tools.paper.in_lockstep import BUS, LATE, find
 from tools.paper.laws import BOTH, DOB, LAWS, PID, TABLE_4_OBSERVER
 from tools.paper.path_study import CORRECTED
-from tools.paper.plant import FORWARD, REVERSE
+from tools.paper.plant import FORWARD, PRINTED, REVERSE
 from tools.paper.printed import TABLE_1, TABLES_5_6, Printed
 from tools.paper.study import CASES, TABLE_5, TABLE_6, TABLE_6_CORRECTED, Result, Study
 
@@ -132,6 +134,7 @@ def as_json(study: Study) -> dict[str, Any]:
             }
             for run in study.firmware
         ],
+        "lockstep": [run.row._asdict() for run in study.lockstep],
         "checks": [check._asdict() for check in checks(study)],
     }
 
@@ -158,6 +161,7 @@ def checks(study: Study) -> list[Check]:
                 f"{table}: max e_y, better of DOB and PID over PID+DOB", times, f">= {BETTER_BY:g}", times >= BETTER_BY
             )
         )
+    found += lockstep_checks(study) if study.car.is_papers else []
     for name, result in study.paths.items():
         for what, value, limit in (
             ("constraint residual", result.fit.constraint_residual, RESIDUAL_WITHIN),
@@ -173,6 +177,33 @@ def checks(study: Study) -> list[Check]:
                 error,
                 f"<= {REAR_AXLE_WITHIN_M:g}",
                 error <= REAR_AXLE_WITHIN_M,
+            )
+        )
+    return found
+
+
+def lockstep_checks(study: Study) -> list[Check]:
+    """The claim of PID + DOB in the real controller, printed sign: without and with one more sample of delay."""
+    found = []
+    for direction in (FORWARD, REVERSE):
+        legs = {
+            (law, delay): find(study.lockstep, law, PRINTED, delay, direction) for law in NAMES for delay in (BUS, LATE)
+        }
+        if None in legs.values():
+            continue
+        figures = {key: leg.row for key, leg in legs.items() if leg is not None}
+        alone = min(figures[(law, BUS)].max_e_y_after_start_m for law in ("dob", "pid"))
+        times = alone / figures[("paper", BUS)].max_e_y_after_start_m
+        found.append(
+            Check(
+                f"controller in lock-step, {direction}: max e_y after the start, better of DOB and PID over PID+DOB",
+                times, f">= {BETTER_BY:g}", times >= BETTER_BY,
+            )
+        )  # fmt: skip
+        worse = figures[("paper", LATE)].rms_e_y_m / figures[("pid", LATE)].rms_e_y_m
+        found.append(
+            Check(
+                f"the same one sample later, {direction}: rms e_y, PID+DOB over PID alone", worse, ">= 1", worse >= 1.0
             )
         )
     return found

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from tools.paper.in_lockstep import BUS, CAR, LATE, find
 from tools.paper.laws import BOTH, DOB, FEEDFORWARD, LAWS, PID
-from tools.paper.plant import FORWARD, REVERSE
+from tools.paper.plant import CORRECTED, FORWARD, PRINTED, REVERSE
 from tools.paper.printed import TABLES_5_6
 from tools.paper.study import CASES, TABLE_5, TABLE_6, TABLE_6_CORRECTED, Result, Study
 from tools.plots.paper_style import (
@@ -207,6 +208,33 @@ def rear_axle_law(study: Study, stem: Path) -> None:
     )
     finish(axes[1], "travelled (m)", "road-wheel angle (rad)", "steering, left positive in travel", legend=True)
     axes[0].set_ylim(-1.3, 1.9)
+    save(figure, stem)
+
+
+def in_controller(study: Study, stem: Path) -> None:
+    """The laws in the controller: PID + DOB on the bus and one sample later; reverse with the corrected sign."""
+    figure, axes = sheet(1, 3, width=14.5, height=4.0)
+    for delay, colour in ((LATE, RED), (BUS, BLUE)):
+        leg = find(study.lockstep, "paper", PRINTED, delay, FORWARD)
+        if leg is not None:
+            s, e, steer = thin(leg.station_m, leg.e_y_m, leg.steer_rad, most=3000)
+            name = f"{delay.total_ms:g} ms: rms {1e3 * leg.row.rms_e_y_m:.2g} mm"
+            axes[0].plot(s, 1e3 * e, color=colour, lw=0.8 if delay == LATE else 1.8, label=name)
+            axes[1].plot(s, steer, color=colour, lw=0.8 if delay == LATE else 1.8, label=f"{delay.total_ms:g} ms")
+    finish(axes[0], "station (m)", "e_y (mm)", "PID+DOB forward, one sample of delay", legend="lower left")
+    finish(axes[1], "station (m)", "road-wheel angle (rad)", "its steering", legend="lower left")
+    for law, name, colour in (("dob", DOB, GREEN), ("pid", PID, ORANGE), ("paper", BOTH, BLUE)):
+        leg = find(study.lockstep, law, CORRECTED, BUS, REVERSE)
+        if leg is not None:
+            s, error = thin(leg.station_m, leg.cross_track_error_m)
+            axes[2].plot(s, 1e3 * error, color=colour, label=name)
+            if not leg.row.is_complete:
+                axes[2].plot(s[-1], 1e3 * error[-1], "x", color=colour, ms=9, mew=2)
+    leg = find(study.lockstep, CAR, CORRECTED, BUS, REVERSE)
+    if leg is not None:
+        s, error = thin(leg.station_m, leg.cross_track_error_m)
+        axes[2].plot(s, 1e3 * error, color=INK, label="law of this project")
+    finish(axes[2], "station (m)", "true error of the CG (mm)", "reverse, corrected sign (x: stopped)", legend=True)
     save(figure, stem)
 
 
