@@ -23,6 +23,7 @@ CORE = "firmware_py.core"
 CORE_MODULES = (
     "signals",
     "conditions",
+    "bounds",
     "tables",
     "path",
     "schedule",

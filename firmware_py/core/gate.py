@@ -7,6 +7,7 @@ follow at all. A value that is no number never passes and never stays.
 import math
 from typing import NamedTuple
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.signals import MODE_ACTIVE, MODE_FAULT
 from firmware_py.core.speed import HOLD_DECEL_MPS2
 from firmware_py.core.supervisor import STOP_EMERGENCY
@@ -79,18 +80,21 @@ def gate(
         speed_mps = 0.0
         brake_mps2 = HOLD_DECEL_MPS2
 
-    speed_mps = max(min(speed_mps, car.max_speed_mps), 0.0)
-    brake_mps2 = max(min(brake_mps2, car.emergency_decel_mps2), 0.0)
+    speed_mps = bounded(speed_mps, 0.0, car.max_speed_mps)
+    brake_mps2 = bounded(brake_mps2, 0.0, car.emergency_decel_mps2)
     if brake_mps2 > 0.0:
         speed_mps = 0.0
 
     # The car's rate less one step of the bus's resolution, so that rounding stays inside it too.
-    step_rad = max(car.max_road_wheel_rate_radps * period_s - lsb_rad, 0.0)
+    step_rad = car.max_road_wheel_rate_radps * period_s - lsb_rad
+    if step_rad < 0.0:
+        step_rad = 0.0
     angle_rad = angle_rad + carry_rad
-    angle_rad = max(min(angle_rad, previous_rad + step_rad), previous_rad - step_rad)
-    angle_rad = max(min(angle_rad, car.max_road_wheel_angle_rad - lsb_rad), lsb_rad - car.max_road_wheel_angle_rad)
+    angle_rad = bounded(angle_rad, previous_rad - step_rad, previous_rad + step_rad)
+    most_rad = car.max_road_wheel_angle_rad - lsb_rad
+    angle_rad = bounded(angle_rad, -most_rad, most_rad)
     sent_rad = math.floor(angle_rad / lsb_rad + 0.5) * lsb_rad
-    remainder_rad = max(min(angle_rad - sent_rad, lsb_rad), -lsb_rad)
+    remainder_rad = bounded(angle_rad - sent_rad, -lsb_rad, lsb_rad)
     return Passed(
         sent_rad,
         remainder_rad,

@@ -155,7 +155,10 @@ def _pose_is_new(inputs: Inputs) -> bool:
 def _age_us(age_us: int, is_new: bool, passed_us: int) -> int:
     if is_new:
         return 0
-    return min(age_us + passed_us, NEVER_US)
+    age_us += passed_us
+    if age_us > NEVER_US:
+        age_us = NEVER_US
+    return age_us
 
 
 def _older(ages: Ages, inputs: Inputs, pose_is_new: bool, passed_us: int) -> Ages:
@@ -175,9 +178,12 @@ def _older(ages: Ages, inputs: Inputs, pose_is_new: bool, passed_us: int) -> Age
 
 
 def _lasting_us(lasting_us: int, is_present: bool, passed_us: int) -> int:
-    if is_present:
-        return min(lasting_us + passed_us, NEVER_US)
-    return 0
+    if not is_present:
+        return 0
+    lasting_us += passed_us
+    if lasting_us > NEVER_US:
+        lasting_us = NEVER_US
+    return lasting_us
 
 
 def assess(
@@ -196,7 +202,8 @@ def assess(
     leak = state.overrun_leak + 1
     if leak >= OVERRUN_LEAK_CYCLES:
         leak = 0
-        bucket = max(bucket - 1, 0)
+        if bucket > 0:
+            bucket -= 1
 
     rejecting = (
         inputs.sys.sys_cmd_timeout != 0 or inputs.steer.steer_cmd_timeout != 0 or inputs.long.long_cmd_timeout != 0

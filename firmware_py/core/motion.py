@@ -11,6 +11,7 @@ road-wheel angle follows the command through a first-order lag under the car's r
 
 import math
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.path import feedforward_curvature_1pm
 from firmware_py.core.tables import CarTable, LegTable
 
@@ -53,13 +54,16 @@ def advance(
     """
     limit_rad = car.max_road_wheel_rate_radps * dt_s
     gap_rad = target_rad - angle_rad
-    change_rad = max(min(car.lag_alpha * gap_rad, limit_rad), -limit_rad)
-    mean_change_rad = max(min((1.0 - car.lag_mean_weight) * gap_rad, limit_rad), -limit_rad)
+    change_rad = bounded(car.lag_alpha * gap_rad, -limit_rad, limit_rad)
+    mean_change_rad = bounded((1.0 - car.lag_mean_weight) * gap_rad, -limit_rad, limit_rad)
     curvature_1pm = math.tan(angle_rad + mean_change_rad + disturbance_rad) / car.wheelbase_m
 
     ds_m = travel_speed_mps * dt_s
     reference_1pm = feedforward_curvature_1pm(leg, station_m + 0.5 * ds_m)
-    path_ds_m = ds_m * math.cos(heading_rad) / max(1.0 - reference_1pm * cross_m, 0.5)
+    radius_share = 1.0 - reference_1pm * cross_m
+    if radius_share < 0.5:
+        radius_share = 0.5
+    path_ds_m = ds_m * math.cos(heading_rad) / radius_share
     heading_change_rad = leg.sigma * (curvature_1pm * ds_m - reference_1pm * path_ds_m)
     return (
         station_m + path_ds_m,

@@ -2,6 +2,7 @@
 
 import math
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.tables import LegTable
 
 
@@ -22,7 +23,8 @@ def _place(leg: LegTable, station_m: float) -> tuple[int, float, float]:
         station = leg.length_m
     at = station / leg.step_m
     row = math.floor(at)
-    row = max(min(row, leg.last_row - 1), 0)
+    if row >= leg.last_row:
+        row = leg.last_row - 1
     return row, at - row, beyond_m
 
 
@@ -75,7 +77,9 @@ def plan_at(leg: LegTable, station_m: float) -> tuple[float, float]:
 
 def feedforward_curvature_1pm(leg: LegTable, station_m: float) -> float:
     """Return the feedforward curvature at a station, held beyond the ends: the one column of the model."""
-    station = max(min(station_m, leg.length_m), 0.0) / leg.step_m
-    row = max(min(math.floor(station), leg.last_row - 1), 0)
+    station = bounded(station_m, 0.0, leg.length_m) / leg.step_m
+    row = math.floor(station)
+    if row >= leg.last_row:
+        row = leg.last_row - 1
     b = station - row
     return (1.0 - b) * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[row + 1]

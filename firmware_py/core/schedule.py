@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.tables import (
     KD,
     KI,
@@ -63,7 +64,7 @@ def gains_at(table: GainTable, direction: int, travel_speed_mps: float, with_yaw
             highest = middle
     low_mps = grid[row]
     b = (travel_speed_mps - low_mps) / (grid[row + 1] - low_mps)
-    b = max(min(b, 1.0), 0.0)
+    b = bounded(b, 0.0, 1.0)
     a = 1.0 - b
     low = table.gain[direction][row]
     high = table.gain[direction][row + 1]

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.path import plan_at
 from firmware_py.core.tables import CarTable, LegTable
 
@@ -63,7 +64,9 @@ def follow(
     Once the remaining distance is what the brake needs, the stop begins and is not taken back.
     """
     remaining_m = leg.length_m - station_now_m
-    speed_mps = max(travel_speed_mps, 0.0)
+    speed_mps = travel_speed_mps
+    if speed_mps < 0.0:
+        speed_mps = 0.0
     braking_m = speed_mps * (car.brake_lag_s + 0.5 * dt_s) + 0.5 * speed_mps * speed_mps / STOP_DECEL_MPS2
     if state.stopping != 0 or remaining_m <= braking_m:
         return (
@@ -71,19 +74,26 @@ def follow(
             SpeedCommand(0.0, STOP_DECEL_MPS2),
         )
     planned_mps, planned_mps2 = plan_at(leg, state.reference_station_m)
-    station_m = min(state.reference_station_m + planned_mps * dt_s, leg.length_m)
-    station_m = min(station_m, station_now_m + REFERENCE_LEAD_M)
+    station_m = state.reference_station_m + planned_mps * dt_s
+    if station_m > leg.length_m:
+        station_m = leg.length_m
+    if station_m > station_now_m + REFERENCE_LEAD_M:
+        station_m = station_now_m + REFERENCE_LEAD_M
     wanted_mps = (
         planned_mps + car.drive_lag_s * planned_mps2 + STATION_GAIN_1PS * (state.reference_station_m - station_now_m)
     )
-    lag_s = max(car.drive_lag_s, LEAST_DRIVE_LAG_S)
+    lag_s = car.drive_lag_s
+    if lag_s < LEAST_DRIVE_LAG_S:
+        lag_s = LEAST_DRIVE_LAG_S
     eased_mps2 = JERK_LIMIT_MPS3 * dt_s
     accel_mps2 = (wanted_mps - speed_mps) / lag_s
-    accel_mps2 = max(min(accel_mps2, state.accel_mps2 + eased_mps2), state.accel_mps2 - eased_mps2)
-    accel_mps2 = max(min(accel_mps2, ACCEL_LIMIT_MPS2), -ACCEL_LIMIT_MPS2)
-    command_mps = max(min(speed_mps + lag_s * accel_mps2, car.max_speed_mps), CREEP_MPS)
+    accel_mps2 = bounded(accel_mps2, state.accel_mps2 - eased_mps2, state.accel_mps2 + eased_mps2)
+    accel_mps2 = bounded(accel_mps2, -ACCEL_LIMIT_MPS2, ACCEL_LIMIT_MPS2)
+    command_mps = bounded(speed_mps + lag_s * accel_mps2, CREEP_MPS, car.max_speed_mps)
     # What the clamps took away is not remembered: the next easing starts from what was asked for.
-    accel_mps2 = min(accel_mps2, (command_mps - speed_mps) / lag_s)
+    commanded_mps2 = (command_mps - speed_mps) / lag_s
+    if accel_mps2 > commanded_mps2:
+        accel_mps2 = commanded_mps2
     return (
         SpeedState(station_m, accel_mps2, 0),
         SpeedCommand(command_mps, 0.0),

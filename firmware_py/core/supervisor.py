@@ -176,7 +176,9 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
             seen |= 1 << c.START_PRESSED
             if enabling_us > ENABLE_TIMEOUT_US:
                 seen |= 1 << c.ENABLE_REFUSED
-    clearing_us = max(state.clearing_us - period_us, 0)
+    clearing_us = state.clearing_us - period_us
+    if clearing_us < 0:
+        clearing_us = 0
     if c.has(conditions, c.CLEAR_PRESSED) and state.mode != MODE_ACTIVE and c.has(conditions, c.STANDSTILL):
         clearing_us = CLEAR_PULSE_US
 
