@@ -25,6 +25,7 @@ nav a{display:block;color:var(--paper);text-decoration:none;padding:.1rem 0}
 .so{border-color:var(--so)}.so b:first-child{color:var(--so)}
 figure{margin:1.4rem 0}
 figure img{width:100%;height:auto;display:block}
+iframe{width:100%;height:980px;border:1px solid var(--line);border-radius:.5rem;margin:1rem 0}
 figcaption{font-size:.9rem;color:var(--grey);margin-top:.3rem}
 table{border-collapse:collapse;margin:1rem 0;font-size:.93rem;font-variant-numeric:tabular-nums}
 th,td{padding:.3rem .75rem;text-align:right;border-bottom:1px solid var(--line);vertical-align:top}
@@ -91,6 +92,11 @@ def figure(file: Path, caption: str) -> str:
         f'<figure id="{file.stem}"><img alt="{plain}" src="data:image/svg+xml;base64,{data}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
+
+
+def embedded(name: str, page: str, title: str) -> str:
+    """A whole page within this one, which keeps to itself."""
+    return f'<iframe id="{name}" title="{escape(title, quote=True)}" srcdoc="{escape(page, quote=True)}"></iframe>'
 
 
 def number(value: float | None, digits: int = 3) -> str:

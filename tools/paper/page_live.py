@@ -50,14 +50,20 @@ def controller(study: Study, picture: Picture) -> str:
         [
             note(
                 OURS,
-                "The controller's process itself, core, tables by (direction, speed), codecs and frames, against the "
+                "The controller itself, its core, tables by (direction, speed), codecs and frames, against the "
                 "emulator whose plant is eq. 11 (scenario <i>paper</i>): wide steering limits, no lag, a report is "
                 f"{BUS.total_ms:g} ms old when its command acts. "
                 "<code>parkctl demo --law paper --scenario paper</code> drives the same before your eyes.",
             ),
             table(
                 "What is left of Tables 5 and 6, printed sign: max e<sub>y</sub> (mm) / rms (mm) / angle (rad)",
-                ("law", "continuous", "in the controller", "max e<sub>y</sub> after the start (mm)", "true error (mm)"),
+                (
+                    "law",
+                    "continuous",
+                    "in the controller",
+                    "max e<sub>y</sub> after the start (mm)",
+                    "true error of the CG (mm)",
+                ),
                 on_bus,
             ),
             note(

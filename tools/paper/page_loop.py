@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from tools.paper.firmware_law import FirmwareRun
-from tools.paper.html import OURS, SAYS, SO, WRONG, equation, note, number, table
+from tools.paper.html import OURS, SAYS, SO, WRONG, embedded, equation, note, number, table
 from tools.paper.in_lockstep import LegRow
 from tools.paper.laws import BOTH, DOB, PID
 from tools.paper.loops import Loops
@@ -278,6 +278,8 @@ def parameter_space(study: Study, loops: Loops, picture: Picture) -> str:
                 ("plant", "point", "boundary: distance"),
                 distances,
             ),
+            "<h3>Step through it</h3>",
+            embedded("explorer", loops.explorer, "admissible gains over speed and region"),
             f"<p>Regions that are empty, in the tool's own words:</p><ul>{refusals}</ul>",
             note(
                 OURS,

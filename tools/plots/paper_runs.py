@@ -223,6 +223,9 @@ def in_controller(study: Study, stem: Path) -> None:
             axes[1].plot(s, steer, color=colour, lw=0.8 if delay == LATE else 1.8, label=f"{delay.total_ms:g} ms")
     finish(axes[0], "station (m)", "e_y (mm)", "PID+DOB forward, one sample of delay", legend="lower left")
     finish(axes[1], "station (m)", "road-wheel angle (rad)", "its steering", legend="lower left")
+    for one in axes[:2]:
+        low, high = one.get_ylim()
+        one.set_ylim(low - 0.25 * (high - low), high)
     for law, name, colour in (("dob", DOB, GREEN), ("pid", PID, ORANGE), ("paper", BOTH, BLUE)):
         leg = find(study.lockstep, law, CORRECTED, BUS, REVERSE)
         if leg is not None:
