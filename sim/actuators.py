@@ -105,10 +105,12 @@ def step_speed(
         speed = speed_mps
     if speed > 0.0:
         speed -= lost
-        speed = max(speed, 0.0)
+        if speed < 0.0:
+            speed = 0.0
     elif speed < 0.0:
         speed += lost
-        speed = min(speed, 0.0)
+        if speed > 0.0:
+            speed = 0.0
     to_stand = decel_target_mps2 > 0.0 or speed_target_mps == 0.0
     if to_stand and -STANDSTILL_SPEED_MPS < speed < STANDSTILL_SPEED_MPS:
         speed = 0.0

@@ -89,7 +89,8 @@ def clearance_m(
                 mirror_distance = sqrt(out_x * out_x + out_y * out_y)
             else:
                 mirror_distance = out_x if out_x > out_y else out_y
-            distance = min(distance, mirror_distance)
+            if mirror_distance < distance:
+                distance = mirror_distance
         if distance < nearest:
             nearest = distance
             nearest_index = index

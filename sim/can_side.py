@@ -52,6 +52,8 @@ class Reception:
 
     def __init__(self, message: Message, timeout_ns: int, decoded: bool) -> None:
         self.message = message
+        self.name = message.name
+        self.length = message.length
         self.timeout_ns = timeout_ns
         self.decoded = decoded
         self._unpack = _packing(message).unpack
@@ -152,13 +154,13 @@ class CanSide:
         if reception is None:
             self.foreign_count += 1
             return None
-        reception.bad_crc = len(data) != reception.message.length or data[0] != _crc(arbitration_id, data)
+        reception.bad_crc = len(data) != reception.length or data[0] != _crc(arbitration_id, data)
         reception.bad_counter = not reception.bad_crc and not reception.accepts(now_ns, data[1] & 0x0F)
         if reception.bad_crc or reception.bad_counter:
             reception.rejected_count += 1
             return None
         reception.last_valid_ns = now_ns
-        return reception.message.name, reception.values(data) if reception.decoded else {}
+        return reception.name, reception.values(data) if reception.decoded else {}
 
 
 class _Transmission:

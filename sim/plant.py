@@ -229,8 +229,12 @@ def advance(car: Car, motion: Motion, m: Memory, now_ns: int, stop_ns: int) -> M
     What acts from outside at `stop_ns` comes before all else: having reached it, this returns without acting there.
     """
     while True:
-        event_ns = min(_next_event_ns(m), stop_ns)
-        until_ns = min(event_ns, now_ns)
+        event_ns = _next_event_ns(m)
+        if event_ns > stop_ns:
+            event_ns = stop_ns
+        until_ns = event_ns
+        if until_ns > now_ns:
+            until_ns = now_ns
         if until_ns > motion.t_ns:
             motion = integrate(car, motion, m, until_ns)
         if event_ns > now_ns or event_ns == stop_ns:
@@ -239,11 +243,16 @@ def advance(car: Car, motion: Motion, m: Memory, now_ns: int, stop_ns: int) -> M
 
 
 def _next_event_ns(m: Memory) -> int:
+    number = m.number
     event_ns = m.system[dbw.NEXT_EVENT_NS]
-    if m.number[STEER_COUNT] != 0:
-        event_ns = min(event_ns, m.number[STEER_DUE_NS + m.number[STEER_FIRST]])
-    if m.number[LONG_COUNT] != 0:
-        event_ns = min(event_ns, m.number[LONG_DUE_NS + m.number[LONG_FIRST]])
+    if number[STEER_COUNT] != 0:
+        due_ns = number[STEER_DUE_NS + number[STEER_FIRST]]
+        if due_ns < event_ns:
+            event_ns = due_ns
+    if number[LONG_COUNT] != 0:
+        due_ns = number[LONG_DUE_NS + number[LONG_FIRST]]
+        if due_ns < event_ns:
+            event_ns = due_ns
     return event_ns
 
 
