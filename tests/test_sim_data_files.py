@@ -424,9 +424,29 @@ def test_mistakes_in_a_course_file(old: str, new: str, message: str, tmp_path: P
         (
             "steering_gain = 0.95",
             "steering_gian = 0.95",
-            "plant.steering_gian: unknown key; known here: steering_gain, steering_bias_rad, "
+            "plant.steering_gian: unknown key; known here: model, reverse_sign, steering_gain, steering_bias_rad, "
             "steering_backlash_rad, steering_command_resolution_rad, longitudinal_latency_samples, unknown, "
             "corners",
+        ),
+        (
+            "steering_gain = 0.95",
+            'model = "eq12"',
+            "plant.model = 'eq12': input should be 'nonlinear' or 'eq11'",
+        ),
+        (
+            "steering_gain = 0.95",
+            'model = "eq11"\nreverse_sign = "minus"',
+            "plant.reverse_sign = 'minus': input should be 'corrected' or 'printed'",
+        ),
+        (
+            "steering_gain = 0.95",
+            'reverse_sign = "printed"',
+            "plant.reverse_sign = 'printed': is for plant.model = \"eq11\" only",
+        ),
+        (
+            "[plant]",
+            'course = "moon"\n[plant]',
+            "course = 'moon': must be the name of a shipped course: ohio, paper",
         ),
         ("mass_kg = 0.3", "mass = 0.3", "plant.corners.mass: unknown key; a vehicle has "),
         ("mass_kg = 0.3", "mass_kg = 1.3", "plant.corners.mass_kg = 1.3: input should be less than or equal to 0.9"),
@@ -443,7 +463,8 @@ def test_mistakes_in_a_course_file(old: str, new: str, message: str, tmp_path: P
         (
             "[sensors]",
             "[sensor]",
-            "sensor: unknown key; known here: name, description, vehicle_overlay, plant, sensors, start, faults",
+            "sensor: unknown key; known here: name, description, course, vehicle_overlay, plant, sensors, start, "
+            "faults",
         ),
         (
             "[sensors]",
@@ -648,7 +669,7 @@ def test_the_guide_to_scenario_files_names_every_key_and_no_other() -> None:
     guide = (FOLDERS["scenario"] / "README.md").read_text()
     named = set(re.findall(r"^\| `([a-z0-9_-]+)` \|", guide, re.MULTILINE))
     tables = (PlantDeviation, Sensors, StartOffset, FaultEvent)
-    keys = {key for table in tables for key in table.model_fields} | {"vehicle_overlay"}
+    keys = {key for table in tables for key in table.model_fields} | {"vehicle_overlay", "course"}
     assert named == keys | set(get_args(FaultKind)) | set(shipped_names("scenario"))
 
 

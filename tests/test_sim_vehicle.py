@@ -230,7 +230,7 @@ def test_1_ms_agrees_with_a_tenth_of_it() -> None:
 
 def independent(p: PlantParameters) -> Callable[[float, np.ndarray], list[float]]:
     """The same physics written down anew: wheel-frame velocities, forces, Newton and Euler in the ground frame."""
-    m, inertia, lf, lr, cf, cr, mu_f, mu_r, sigma, df, dr = p
+    m, inertia, lf, lr, cf, cr, mu_f, mu_r, sigma, df, dr = p[:11]
 
     def force(stiffness: float, damping: float, limit: float, slip: float, slip_rate: float) -> float:
         z = stiffness * slip / limit
@@ -289,7 +289,11 @@ def compiled(function: Callable[..., Any], **replaced: Any) -> Callable[..., Any
 
 
 def test_the_step_compiles_and_gives_the_same_bits() -> None:
-    fast = compiled(sim.vehicle.step, brush_factor=compiled(sim.tyre.brush_factor))
+    fast = compiled(
+        sim.vehicle.step,
+        brush_factor=compiled(sim.tyre.brush_factor),
+        step_eq11=compiled(sim.vehicle.step_eq11),
+    )
     plain = quick = at_rest()
     for i in range(3000):
         speed, angle = profile(i * 2e-3)

@@ -9,7 +9,18 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field
 
 from sim.data_files.course import Pose
-from sim.data_files.reading import STRICT, Finite, Name, Text, find_file, read_toml, shown, shown_key, validate
+from sim.data_files.reading import (
+    STRICT,
+    Finite,
+    Name,
+    Text,
+    find_file,
+    read_toml,
+    shipped_names,
+    shown,
+    shown_key,
+    validate,
+)
 from sim.data_files.vehicle import PARAMETERS, Vehicle, check_parameters
 from sim.errors import UserError
 from sim.faults import FaultEvent
@@ -135,6 +146,9 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         raise UserError(
             f'{path}: plant.reverse_sign = {scenario.plant.reverse_sign!r}: is for plant.model = "eq11" only'
         )
+    if scenario.course is not None and scenario.course not in shipped_names("course"):
+        known = ", ".join(shipped_names("course"))
+        raise UserError(f"{path}: course = {scenario.course!r}: must be the name of a shipped course: {known}")
     check_parameters(scenario.vehicle_overlay, f"{path}: vehicle_overlay.")
     for low_or_high in (0, 1):
         check_parameters({k: v[low_or_high] for k, v in scenario.plant.unknown.items()}, f"{path}: plant.unknown.")
