@@ -18,6 +18,7 @@ from typing import Any
 import can
 import cantools.database
 import pytest
+from live_support import again_where_the_machine_was_away
 
 from sim.can_side import CanSide
 from sim.data_files import FOLDERS
@@ -92,13 +93,18 @@ class Demo:
         return json.loads((self.out / "figures.json").read_text())
 
 
+def columns_of(demo: Demo, *names: str) -> list[list[float]]:
+    """Columns of the plant's record of the run."""
+    lines = [line.split(",") for line in (demo.out / "truth.csv").read_text().splitlines()]
+    return [[float(line[lines[0].index(name)]) for line in lines[1:]] for name in names]
+
+
 def speeds_of(demo: Demo) -> list[float]:
-    """True speeds of the run, from the plant's record."""
-    lines = (demo.out / "truth.csv").read_text().splitlines()
-    column = lines[0].split(",").index("speed_mps")
-    return [float(line.split(",")[column]) for line in lines[1:]]
+    """True speeds of the run."""
+    return columns_of(demo, "speed_mps")[0]
 
 
+@again_where_the_machine_was_away
 def test_a_demo_passes_and_leaves_a_whole_run(tmp_path: Path) -> None:
     file = tmp_path / "figures.json"
     demo = Demo(tmp_path, "--json", str(file), "--side", "right")
@@ -143,6 +149,7 @@ def interrupted(tmp_path: Path, wait_for: str | None, after_s: float, *, number:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@again_where_the_machine_was_away
 def test_an_interrupt_on_the_way_stops_the_car_first(tmp_path: Path, number: int) -> None:
     demo = interrupted(tmp_path, "\nForward", 4.0, number=number)
     begun = time.monotonic()
@@ -152,10 +159,12 @@ def test_an_interrupt_on_the_way_stops_the_car_first(tmp_path: Path, number: int
     assert error == (
         "parkctl: not passed: interrupted in leg Forward: the operator's stop brought the car to standstill\n"
     )
-    speeds = speeds_of(demo)
+    times, speeds = columns_of(demo, "t_s", "speed_mps")
     assert max(speeds) > 0.3, "the car was driving"
     assert speeds[-1] == 0.0, "and stands in the end"
-    assert max(a - b for a, b in pairwise(speeds)) <= 0.013  # by the controlled stop, not harder
+    # By the controlled stop, not harder; a row that was skipped is a longer step.
+    slowed_mps2 = [(v - w) / (b - a) for (a, b), (v, w) in zip(pairwise(times), pairwise(speeds), strict=True)]
+    assert max(slowed_mps2) <= 1.3
     assert demo.figures()["passed"] is False
 
 
@@ -170,6 +179,7 @@ def test_an_interrupt_before_the_car_drives(tmp_path: Path, after_s: float) -> N
     assert not children_of(demo.process.pid)
 
 
+@again_where_the_machine_was_away
 def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     demo = interrupted(tmp_path, "\nForward", 3.0)
     time.sleep(0.1)
@@ -181,6 +191,7 @@ def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     assert "interrupted" in error
 
 
+@again_where_the_machine_was_away
 def test_a_killed_controller_is_said_and_the_watchdog_stops_the_car(tmp_path: Path) -> None:
     demo = Demo(tmp_path)
     demo.note_children()
@@ -199,6 +210,7 @@ def test_a_killed_controller_is_said_and_the_watchdog_stops_the_car(tmp_path: Pa
     assert "not completed" in demo.text
 
 
+@again_where_the_machine_was_away
 def test_a_killed_plant_is_said_and_the_controller_ends_by_itself(tmp_path: Path) -> None:
     demo = Demo(tmp_path)
     demo.note_children()
@@ -212,6 +224,7 @@ def test_a_killed_plant_is_said_and_the_controller_ends_by_itself(tmp_path: Path
     assert demo.figures()["exam"] is None
 
 
+@again_where_the_machine_was_away
 def test_a_second_controller_on_the_way_stops_the_car(tmp_path: Path) -> None:
     demo = Demo(tmp_path)
     demo.note_children()
@@ -227,6 +240,7 @@ def test_a_second_controller_on_the_way_stops_the_car(tmp_path: Path) -> None:
     assert speeds_of(demo)[-1] == 0.0
 
 
+@again_where_the_machine_was_away
 def test_a_second_demo_on_the_same_bus_is_refused(tmp_path: Path) -> None:
     demo = Demo(tmp_path)
     demo.note_children()
@@ -242,6 +256,7 @@ def test_a_second_demo_on_the_same_bus_is_refused(tmp_path: Path) -> None:
     demo.end()
 
 
+@again_where_the_machine_was_away
 def test_a_car_that_stands_a_metre_off_does_not_start(tmp_path: Path) -> None:
     scenario = (FOLDERS["scenario"] / "car.toml").read_text() + "\n[start]\nahead_m = -1.0\n"
     (tmp_path / "off.toml").write_text(scenario)
@@ -256,6 +271,7 @@ def test_a_car_that_stands_a_metre_off_does_not_start(tmp_path: Path) -> None:
     assert set(speeds_of(demo)) == {0.0}
 
 
+@again_where_the_machine_was_away
 def test_the_operators_keys_start_stop_and_clear(tmp_path: Path) -> None:
     """Three processes by hand, as in three terminals; the station's keys come from a terminal."""
     common = ["-i", "loopbus", "-c", "28620"]

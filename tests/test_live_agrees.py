@@ -6,6 +6,7 @@ import sys
 
 import pytest
 from core_support import ROOT, TABLES
+from live_support import again_where_the_machine_was_away
 
 from sim.data_files import load_course, load_scenario, load_vehicle
 from tools.figures import leg_figures, load_path, split_legs, truth_of_rows
@@ -26,6 +27,7 @@ TOLERANCE = {
 
 
 @pytest.mark.live
+@again_where_the_machine_was_away
 def test_live_and_lockstep_agree(tmp_path):
     out = tmp_path / "run"
     command = [sys.executable, "-m", "tools.cli", "demo", "--no-plots", "--seed", str(SEED), "--out", str(out)]
