@@ -3,10 +3,13 @@
 import random
 
 import pytest
-from core_support import TABLES, shipped_tables, standing_inputs
+from core_support import TABLES, shipped_codec, shipped_tables, standing_inputs
 
 from firmware_py.core import controller
 from firmware_py.core import signals as s
+from firmware_py.core.controller import PERIOD_S
+from firmware_py.node import build_tables
+from firmware_py.table_file import load_tables
 from sim.data_files import load_course, load_scenario, load_vehicle
 from tools.compiled import array_tables, compiled_step
 from tools.lockstep import run_lockstep
@@ -17,7 +20,7 @@ def step():
     return compiled_step()
 
 
-def recorded(monkeypatch, side, law, seed):
+def recorded(monkeypatch, side, law, seed, scenario="car", course="ohio", folder=TABLES):
     """Inputs and outputs of every cycle of a lock-step run."""
     cycles = []
     plain = controller.step
@@ -29,9 +32,9 @@ def recorded(monkeypatch, side, law, seed):
 
     with monkeypatch.context() as patch:
         patch.setattr(controller, "step", recording)
-        run_lockstep(
-            load_vehicle("paper"), load_course("ohio"), load_scenario("car"), side, seed, law, TABLES, longest_s=60.0
-        )
+        world = load_scenario(scenario)
+        vehicle = load_vehicle("paper", world.vehicle_overlay)
+        run_lockstep(vehicle, load_course(course), world, side, seed, law, folder, longest_s=60.0)
     return cycles
 
 
@@ -46,6 +49,18 @@ def test_compiled_and_plain_agree_bit_for_bit_over_a_manoeuvre(monkeypatch, step
         state, outputs = step(tables, state, inputs)
         assert state == plain_state, f"state after cycle {number}"
         assert outputs == plain_outputs, f"outputs of cycle {number}"
+
+
+def test_so_they_do_by_the_papers_law_to_its_stop_in_reverse(monkeypatch, step):
+    folder = TABLES.parent / "paper-study"
+    cycles = recorded(monkeypatch, "right", "paper", 1, "paper", "paper", folder)
+    assert {outputs.sys.control_leg for _, _, outputs in cycles} >= {s.LEG_FORWARD, s.LEG_REVERSE}
+    assert max(abs(state.paper.cross_track_error_m) for _, state, _ in cycles) > 0.05
+    tables = array_tables(build_tables(load_tables(folder, "right", "paper", PERIOD_S), shipped_codec()))
+    state = controller.begin()
+    for number, (inputs, plain_state, plain_outputs) in enumerate(cycles):
+        state, outputs = step(tables, state, inputs)
+        assert (state, outputs) == (plain_state, plain_outputs), f"cycle {number}"
 
 
 def test_compiled_and_plain_agree_on_faults_and_nonsense(step):

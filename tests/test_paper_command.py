@@ -9,10 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim.data_files import Vehicle
 from tools import cli
-from tools.paper import figures, fit, loops, rates, sampled_run, study
+from tools.design import gains as design_gains
+from tools.design import tables
+from tools.paper import figures, fit, in_lockstep, loops, rates, sampled_run, study
 from tools.paper.fit import STORED
 from tools.paper.laws import LAWS
+from tools.paper.plant import PRINTED
 from tools.paper.sampled_run import SampledRun
 from tools.plots import paper_diagrams
 
@@ -93,6 +97,11 @@ def test_the_whole_command_for_another_car(
             (folder / f"{name}.svg").write_text(SVG)
         return names
 
+    def shipped_gains(vehicle: Vehicle) -> dict[str, list[list[float]]]:
+        folder = tables.SHIPPED_FOLDER / f"{vehicle.name}-ohio"
+        texts = {law: (folder / f"gains_{law}.csv").read_text().splitlines()[3:] for law in design_gains.LAWS}
+        return {law: [[float(cell) for cell in line.split(",")] for line in lines] for law, lines in texts.items()}
+
     for module in (
         study,
         rates,
@@ -102,6 +111,9 @@ def test_the_whole_command_for_another_car(
     monkeypatch.setattr(sampled_run, "run", quick_run)
     monkeypatch.setattr(loops, "highest_stable_bandwidth", lambda *_: 50.0)
     monkeypatch.setattr(figures, "draw_all", quick_pictures)
+    monkeypatch.setattr(loops, "EXPLORER_CELLS", 11)
+    monkeypatch.setattr(design_gains, "design_gains", shipped_gains)
+    monkeypatch.setattr(in_lockstep, "CASES", (("paper", PRINTED, in_lockstep.BUS),))
     out, file = tmp_path / "out", tmp_path / "paper.json"
     status = cli.main(["paper", "--vehicle", "fusion", "--out", str(out), "--json", str(file)])
     content = json.loads(file.read_text())
@@ -118,6 +130,11 @@ def test_the_whole_command_for_another_car(
     assert content["table4"]["M_kg"]["paper"] is None
     assert content["steering_rates"]["step_that_gives_the_printed_rate_s"] == {"forward": None, "reverse": None}
     assert len(content["firmware_law"]) == 18
+    assert [(row["law"], row["direction"]) for row in content["lockstep"]] == [
+        ("paper", "forward"),
+        ("paper", "reverse"),
+    ]
+    assert all(row["max_e_y_after_start_m"] < 1e-3 and row["is_complete"] for row in content["lockstep"])
     assert content["table1"]["m"] == {"paper": 4, "ours": 4}
     assert all(content["rear_axle_law"][way]["max_cross_track_m"] <= 1e-3 for way in ("forward", "reverse"))
     page = (out / "index.html").read_text()
@@ -127,6 +144,8 @@ def test_the_whole_command_for_another_car(
         assert f"Table {table}" in page
     outside = re.findall(r'(?:src|href)="(?!data:|#)([^"]*)"', page)
     assert not outside
+    assert page.count("<iframe") == 1
+    assert "srcdoc=" in page
     assert "@import" not in page
     assert "url(" not in page
     assert "the paper has" not in page
