@@ -171,27 +171,29 @@ class _Transmission:
         self._pack = _packing(message).pack
         self._crc_name, self._counter_name = f"{message.name}_crc", f"{message.name}_counter"
         self._counter = 0
-        self._limits = [
-            (
-                signal.name,
-                float(signal.minimum or 0),
-                float(signal.maximum or 0),
-                _start_value(signal),
-                signal.scale,
-                signal.offset,
-                (signal.scale, signal.offset) == (1, 0),
-            )
-            for signal in message.signals
-            if signal.name not in (self._crc_name, self._counter_name)
+        payload = [s for s in message.signals if s.name not in (self._crc_name, self._counter_name)]
+        # A number is compared with its own kind: a float with an integer takes three times as long.
+        self._plain = [
+            (s.name, round(s.minimum or 0), round(s.maximum or 0), _start_value(s)) for s in payload if _is_plain(s)
+        ]
+        self._scaled = [
+            (s.name, float(s.minimum or 0), float(s.maximum or 0), _start_value(s), s.scale, s.offset)
+            for s in payload
+            if not _is_plain(s)
         ]
 
     def next_frame(self, values: Mapping[str, float]) -> tuple[int, bytes]:
         raw = {self._crc_name: 0, self._counter_name: self._counter}
-        for name, low, high, start, scale, offset, is_plain in self._limits:
+        for name, least, most, start in self._plain:
+            value = values[name]
+            if not least <= value <= most:
+                value = most if value > most else least if value < least else start
+            raw[name] = round(value)
+        for name, low, high, start, scale, offset in self._scaled:
             value = values[name]
             if not low <= value <= high:
                 value = high if value > high else low if value < low else start
-            raw[name] = round(value) if is_plain else round((value - offset) / scale)
+            raw[name] = round((value - offset) / scale)
         self._counter = (self._counter + 1) % _COUNTERS
         data = bytearray(self._pack(raw))
         data.reverse()
@@ -213,15 +215,25 @@ def _packing(message: Message) -> _Packing:
     return cast(_Packing, create_encode_decode_formats(message.signals, message.length).little_endian)
 
 
+def _is_plain(signal: Signal) -> bool:
+    """Whether the signal's value is what goes over the bus, a whole number between whole limits."""
+    limits = (signal.minimum or 0, signal.maximum or 0)
+    return (signal.scale, signal.offset) == (1, 0) and all(limit == round(limit) for limit in limits)
+
+
 def _start_value(signal: Signal) -> float:
     return float(signal.raw_initial or 0) * signal.scale + signal.offset
 
 
 def _crc(data_id: int, data: bytes | bytearray) -> int:
     """End-to-end CRC over the data id, low byte first, and all bytes but the first."""
-    crc = _CRC_TABLE[_CRC_TABLE[data_id % 256] ^ data_id // 256]
+    t = _CRC_TABLE
+    crc = t[t[data_id % 256] ^ data_id // 256]
+    if len(data) == 8:  # every message of the project
+        _, b1, b2, b3, b4, b5, b6, b7 = data
+        return t[t[t[t[t[t[t[crc ^ b1] ^ b2] ^ b3] ^ b4] ^ b5] ^ b6] ^ b7]
     for byte in data[1:]:
-        crc = _CRC_TABLE[crc ^ byte]
+        crc = t[crc ^ byte]
     return crc
 
 
