@@ -86,7 +86,7 @@ def step_speed(
     While the brake is asked for, the drive is off and the brake acts against the motion, down to exactly 0. Without
     it the speed follows its target with a first-order lag, and what is left of the brake still acts.
     """
-    if brake_lag_s > 0.0:
+    if brake_lag_s > 0.0 and decel_mps2 != decel_target_mps2:
         decay = exp(-h / brake_lag_s)
         excess = decel_mps2 - decel_target_mps2
         decel_next = decel_target_mps2 + excess * decay

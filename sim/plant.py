@@ -331,28 +331,33 @@ def integrate(car: Car, motion: Motion, m: Memory, until_ns: int) -> Motion:
 
 def _remember(m: Memory, t_ns: int, body: PlantState) -> None:
     number = m.number
-    place = (number[PAST_FIRST] + number[PAST_COUNT]) % HISTORY
-    if number[PAST_COUNT] == HISTORY:
-        number[PAST_FIRST] = (number[PAST_FIRST] + 1) % HISTORY
+    value = m.value
+    count = number[PAST_COUNT]
+    place = (number[PAST_FIRST] + count) % HISTORY
+    if count == HISTORY:
+        number[PAST_FIRST] = (place + 1) % HISTORY
     else:
-        number[PAST_COUNT] += 1
+        number[PAST_COUNT] = count + 1
     number[PAST_NS + place] = t_ns
-    m.value[PAST_X_M + place] = body.x_m
-    m.value[PAST_Y_M + place] = body.y_m
-    m.value[PAST_YAW_RAD + place] = body.yaw_rad
+    value[PAST_X_M + place] = body.x_m
+    value[PAST_Y_M + place] = body.y_m
+    value[PAST_YAW_RAD + place] = body.yaw_rad
 
 
 def pose_at(car: Car, m: Memory, t_ns: int) -> tuple[float, float, float]:
     """Rear-axle pose at an earlier instant, between two steps by linear interpolation; forgets what is older."""
     number = m.number
-    while number[PAST_COUNT] > 1 and number[PAST_NS + (number[PAST_FIRST] + 1) % HISTORY] <= t_ns:
-        number[PAST_FIRST] = (number[PAST_FIRST] + 1) % HISTORY
-        number[PAST_COUNT] -= 1
     first = number[PAST_FIRST]
+    count = number[PAST_COUNT]
+    while count > 1 and number[PAST_NS + (first + 1) % HISTORY] <= t_ns:
+        first = (first + 1) % HISTORY
+        count -= 1
+    number[PAST_FIRST] = first
+    number[PAST_COUNT] = count
     x = m.value[PAST_X_M + first]
     y = m.value[PAST_Y_M + first]
     yaw = m.value[PAST_YAW_RAD + first]
-    if number[PAST_NS + first] < t_ns and number[PAST_COUNT] > 1:
+    if number[PAST_NS + first] < t_ns and count > 1:
         later = (first + 1) % HISTORY
         share = (t_ns - number[PAST_NS + first]) / (number[PAST_NS + later] - number[PAST_NS + first])
         x += share * (m.value[PAST_X_M + later] - x)
