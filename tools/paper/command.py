@@ -105,12 +105,12 @@ NAMES = {
     "table6_corrected": "Table 6, reverse, sign corrected (not in the paper)",
 }
 FIELDS = {
-    "max_e_y_m": "max e_y, m",
-    "rms_e_y_m": "rms e_y, m",
-    "max_steer_rad": "max angle, rad",
-    "max_steer_rate_radps": "max rate, rad/s",
-    "max_cross_track_m": "true CG error, m",
-    "min_clearance_m": "clearance, m",
+    "max_e_y_m": ("max e_y, mm", 1e3),
+    "rms_e_y_m": ("rms e_y, mm", 1e3),
+    "max_steer_rad": ("max angle, rad", 1.0),
+    "max_steer_rate_radps": ("max rate, rad/s", 1.0),
+    "max_cross_track_m": ("CG error, mm", 1e3),
+    "min_clearance_m": ("clearance, m", 1.0),
 }
 
 
@@ -119,12 +119,14 @@ def _print(console: Console, results: Study, content: dict[str, Any]) -> None:
 
     for name, title in NAMES.items():
         table = Table(title=f"{title}: paper / ours", title_justify="left")
-        table.add_column("", min_width=14)
+        table.add_column("", no_wrap=True)
         for law in content[name]:
-            table.add_column(law, justify="right", no_wrap=True)
-        for field, heading in FIELDS.items():
+            table.add_column(law, justify="right")
+        for field, (heading, scale) in FIELDS.items():
             cells = [content[name][law][field] for law in content[name]]
-            table.add_row(heading, *(f"{_number(cell['paper'])} / {_number(cell['ours'])}" for cell in cells))
+            table.add_row(
+                heading, *(f"{_number(cell['paper'], scale)} / {_number(cell['ours'], scale)}" for cell in cells)
+            )
         console.print(table)
     for law, leaving in results.leaving.items():
         room = "stays" if leaving.room_m is None else f"leaves after {leaving.room_m:.2f} m"
@@ -137,6 +139,7 @@ def _print(console: Console, results: Study, content: dict[str, Any]) -> None:
             console,
             f"rear-axle law on the same plant, {direction}: {1e3 * figures['max_cross_track_m']:.2f} mm at most",
         )
+    _print_lockstep(console, content["lockstep"])
     for check in content["checks"]:
         if not check["holds"]:
             _say(console, f"OUT OF TOLERANCE: {check['name']}: {check['value']:.4g}, wanted {check['limit']}")
@@ -144,5 +147,29 @@ def _print(console: Console, results: Study, content: dict[str, Any]) -> None:
     _say(console, f"checks: {held} of {len(content['checks'])} hold")
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+def _print_lockstep(console: Console, rows: list[dict[str, Any]]) -> None:
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="In the controller, lock-step on eq. 11 (sign in reverse); errors in mm", title_justify="left")
+    for heading in ("law", "leg", "ms old", "max e_y", "rms e_y", "CG error", "rear axle", "ends"):
+        table.add_column(heading, justify="left" if heading in ("law", "leg") else "right", no_wrap=True)
+    shown = set()
+    for row in rows:
+        forward = row["direction"] == "forward"
+        key = (row["law"], row["direction"], "" if forward else row["reverse_sign"], row["delay_ms"])
+        if key in shown:
+            continue  # forward both signs are the same
+        shown.add(key)
+        errors = ("max_e_y_m", "rms_e_y_m", "max_cross_track_m", "max_rear_cross_track_m")
+        table.add_row(
+            row["law"], row["direction"] if forward else row["reverse_sign"], f"{row['delay_ms']:g}",
+            *(f"{1e3 * row[key]:.3g}" for key in errors),
+            "stop" if row["is_complete"] else f"{row['travelled_m']:.1f} m",
+        )  # fmt: skip
+    console.print(table)
+
+
+def _number(value: float | None, scale: float) -> str:
+    if value is None:
+        return "-"
+    return f"{scale * value:.3g}" if abs(scale * value) < 1e3 else f"{scale * value:.0f}"
