@@ -114,6 +114,7 @@ def test_the_whole_command_for_another_car(
     monkeypatch.setattr(loops, "EXPLORER_CELLS", 11)
     monkeypatch.setattr(design_gains, "design_gains", shipped_gains)
     monkeypatch.setattr(in_lockstep, "CASES", (("paper", PRINTED, in_lockstep.BUS),))
+    monkeypatch.setattr(in_lockstep, "real_parts", lambda _vehicle: {})
     out, file = tmp_path / "out", tmp_path / "paper.json"
     status = cli.main(["paper", "--vehicle", "fusion", "--out", str(out), "--json", str(file)])
     content = json.loads(file.read_text())

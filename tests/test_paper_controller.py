@@ -21,7 +21,7 @@ from firmware_py.core.tables import Tables
 from firmware_py.node import build_tables
 from firmware_py.table_file import load_tables
 from sim import vehicle as plant_model
-from sim.data_files import load_scenario
+from sim.data_files import load_scenario, load_vehicle
 from sim.vehicle import EQ11, PlantParameters, PlantState, plant_parameters, state_at_rest, step
 from tools import cli
 from tools.compiled import compile_modules
@@ -29,7 +29,7 @@ from tools.lockstep import DBC
 from tools.paper import fit, in_lockstep, page_live
 from tools.paper.firmware_law import NAMES, UNBOUNDED
 from tools.paper.firmware_tables import SCENARIO, study_folder, study_pair
-from tools.paper.in_lockstep import BUS, CAR, LATE, LegRow, Manoeuvre
+from tools.paper.in_lockstep import BUS, CAR, LATE, LegRow, Manoeuvre, Runs
 from tools.paper.laws import Law
 from tools.paper.path_study import AS_PRINTED, all_variants
 from tools.paper.plant import CORRECTED, FORWARD, PRINTED, REVERSE, TABLE_4, PaperCar, Plant, matrices
@@ -140,6 +140,18 @@ def runs(setting: Manoeuvre) -> list[in_lockstep.LegRun]:
 
 
 @pytest.fixture(scope="module")
+def with_part(setting: Manoeuvre) -> list[in_lockstep.LegRun]:
+    """Forward with the first and the last of the real parts."""
+    parts = list(in_lockstep.real_parts(load_vehicle("paper")).items())
+    return [
+        leg
+        for part, changes in (parts[0], parts[-1])
+        for law in ("pid", "paper")
+        for leg in in_lockstep.drive(setting, law, CORRECTED, BUS, part=part, changes=changes)
+    ]
+
+
+@pytest.fixture(scope="module")
 def continuous(setting: Manoeuvre) -> dict[tuple[str, str], Figures]:
     found = {}
     for direction, track in setting.tracks.items():
@@ -207,15 +219,30 @@ def test_the_true_sign_ends_it_in_reverse_and_the_law_for_the_rear_axle_drives_i
             assert ours.max_rear_cross_track_m <= 1e-3
 
 
+def test_what_a_car_has_beside_equation_11_is_too_much_for_the_observer_not_for_the_pid(
+    runs: list[in_lockstep.LegRun], with_part: list[in_lockstep.LegRun]
+) -> None:
+    """A bandwidth of 100 rad/s beside 20 ms of lag, and beside tyres that relax over 0.4 m, 0.4 s at 1 m/s."""
+    assert [(leg.row.law, leg.row.part.split()[0]) for leg in with_part] == [
+        ("pid", "a"), ("paper", "a"), ("pid", "its"), ("paper", "its")
+    ]  # fmt: skip
+    for pid, together in (with_part[:2], with_part[2:]):
+        alone = row(runs, "pid", PRINTED, BUS, FORWARD)
+        assert pid.row.rms_e_y_m == pytest.approx(alone.rms_e_y_m, rel=0.1)
+        assert together.row.rms_e_y_m > 40.0 * row(runs, "paper", PRINTED, BUS, FORWARD).rms_e_y_m
+
+
 def test_the_section_of_the_page_holds_them(
-    runs: list[in_lockstep.LegRun], continuous: dict[tuple[str, str], Figures]
+    runs: list[in_lockstep.LegRun],
+    with_part: list[in_lockstep.LegRun],
+    continuous: dict[tuple[str, str], Figures],
 ) -> None:
     class Result:
         def __init__(self, figures: Figures) -> None:
             self.figures = figures
 
     class Study:
-        lockstep = runs
+        lockstep = Runs(runs, with_part)
         results = {  # noqa: RUF012
             table: {law: Result(continuous[(name, direction)]) for name, law in NAMES.items()}
             for table, direction in (("table5", FORWARD), ("table6", REVERSE))

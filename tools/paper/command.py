@@ -151,7 +151,7 @@ def _print_lockstep(console: Console, rows: list[dict[str, Any]]) -> None:
     from rich.table import Table  # noqa: PLC0415
 
     table = Table(title="In the controller, lock-step on eq. 11 (sign in reverse); errors in mm", title_justify="left")
-    for heading in ("law", "leg", "ms old", "max e_y", "rms e_y", "CG error", "rear axle", "ends"):
+    for heading in ("law", "leg", "ms old", "max e_y", "rms e_y", "CG error", "axle", "ends"):
         table.add_column(heading, justify="left" if heading in ("law", "leg") else "right", no_wrap=True)
     shown = set()
     for row in rows:

@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.core.signals import MODE_FAULT
 from firmware_py.reasons import TEXT
 from sim.data_files import Course, Scenario, Vehicle, load_scenario
 from tools.design import tables as design_tables
 from tools.design.waypoints import Floats
 from tools.figures import Leg, Truth, load_path, load_preview, split_legs, truth_of_rows
-from tools.lockstep import COMPUTE_NS, PERIOD_NS, LockstepRun, run_lockstep
+from tools.lockstep import COMPUTE_NS, LONGEST_S, PERIOD_NS, LockstepRun, run_lockstep
 from tools.paper.firmware_law import NAMES
 from tools.paper.firmware_tables import SCENARIO, study_report
 from tools.paper.fit import StoredFit, load_fit
@@ -53,12 +54,34 @@ START_M = 0.5
 """What belongs to the start: eq. 11's speeds begin at 0.1 m/s, a car's at 0, and a path with free ends begins bent."""
 
 
+STEERING_LAG_S = 0.02
+FORWARD_S = 30.0
+"""Virtual time within which the forward leg is over."""
+
+
+def real_parts(vehicle: Vehicle) -> dict[str, dict[str, object]]:
+    """What a car has that eq. 11 has not, one at a time: name, and the changes in the scenario's plant."""
+    rate, length = vehicle.max_road_wheel_rate_radps, vehicle.relaxation_length_m
+    unknown = {
+        f"a steering lag of {1e3 * STEERING_LAG_S:g} ms": {"steering_lag_s": STEERING_LAG_S},
+        f"its own rack of {rate:g} rad/s": {"max_road_wheel_rate_radps": rate},
+    }
+    parts: dict[str, dict[str, object]] = {
+        name: {"unknown": {key: (value, value) for key, value in of.items()}} for name, of in unknown.items()
+    }
+    parts[f"its own tyres, relaxing over {length:g} m"] = {
+        "model": "nonlinear",
+        "unknown": {"relaxation_length_m": (length, length)},
+    }
+    return parts
+
+
 class LegRow(NamedTuple):
     """One leg of one run; e_y and cross_track are the centre of gravity's, true figures of the plant.
 
     `*_after_start_*` leave out the first START_M, `max_rear_cross_track_m`: that of the rear axle against its own
     path. `is_complete`: the leg came to its stop; `travelled_m`: how far it came; `reason`: why the controller
-    stopped the car, by its number, 0 where it did not.
+    stopped the car, by its number, 0 where it did not. `part`: the real part that the car has, "" for none.
     """
 
     law: str
@@ -76,6 +99,7 @@ class LegRow(NamedTuple):
     travelled_m: float
     is_complete: bool
     reason: int
+    part: str
 
 
 class LegRun(NamedTuple):
@@ -98,9 +122,16 @@ class Manoeuvre(NamedTuple):
     tracks: dict[str, Track]
 
 
+class Runs(NamedTuple):
+    """All legs of all cases, and the forward legs with one real part of the car each."""
+
+    legs: list[LegRun]
+    with_part: list[LegRun]
+
+
 def study(
     vehicle: Vehicle, course: Course, stored: StoredFit, tracks: dict[str, Track], tell: Callable[[str], None]
-) -> list[LegRun]:
+) -> Runs:
     """Drive every case; `vehicle` is as its file has it. Tables that are not shipped are made now (15 s)."""
     scenario = load_scenario(SCENARIO)
     car = vehicle.with_overlay(scenario.vehicle_overlay)
@@ -115,47 +146,54 @@ def study(
         for law, sign, delay in CASES:
             tell(f"the controller in lock-step: law {law}, {sign} sign, {delay.total_ms:g} ms")
             runs += drive(setting, law, sign, delay)
-    return runs
+        with_part: list[LegRun] = []
+        for part, changes in real_parts(vehicle).items():
+            tell(f"the controller in lock-step: eq. 11 with {part}")
+            for law in NAMES:
+                with_part += drive(setting, law, CORRECTED, BUS, part=part, changes=changes)
+    return Runs(runs, with_part)
 
 
-def drive(setting: Manoeuvre, law: str, sign: str, delay: Delay, *, on_path: bool = True) -> list[LegRun]:
-    """Drive one manoeuvre; one entry a leg. The start is on the path, or that of eq. 20, where free ends leave it."""
+def drive(
+    setting: Manoeuvre, law: str, sign: str, delay: Delay, *, part: str = "", changes: dict[str, object] | None = None
+) -> list[LegRun]:
+    """Drive one manoeuvre from the path's first point; one entry a leg. With a real part: `changes`, forward alone."""
     path = load_path(setting.folder, "left")
-    scenario = _scenario(setting, sign, delay, on_path=on_path)
+    scenario = _scenario(setting, sign, delay, changes or {})
+    longest_s = FORWARD_S if part else LONGEST_S
     run = run_lockstep(
-        setting.vehicle, setting.course, scenario, "left", 0, law, setting.folder, phase_ms=delay.phase_ms
-    )
+        setting.vehicle, setting.course, scenario, "left", 0, law, setting.folder,
+        phase_ms=delay.phase_ms, longest_s=longest_s,
+    )  # fmt: skip
     truth = truth_of_rows(run.truth)
     legs = split_legs(truth, path, load_preview(setting.folder, law))
-    return [_leg_run(setting, law, sign, delay, run, truth, leg, leg is legs[-1]) for leg in legs]
+    kept = legs[:1] if part else legs
+    return [_leg_run(setting, law, sign, delay, part, run, truth, leg, leg is legs[-1]) for leg in kept]
 
 
-def _scenario(setting: Manoeuvre, sign: str, delay: Delay, *, on_path: bool) -> Scenario:
+def _scenario(setting: Manoeuvre, sign: str, delay: Delay, changes: dict[str, object]) -> Scenario:
     scenario = setting.scenario
-    plant = scenario.plant.model_copy(update={"reverse_sign": sign})
+    plant = scenario.plant.model_copy(update={"reverse_sign": sign, **changes})
     if delay.samples:
         late = float(delay.samples)
-        plant = plant.model_copy(update={"unknown": {"command_latency_samples": (late, late)}})
-    changes: dict[str, object] = {"plant": plant}
-    if on_path:
-        path, pose = load_path(setting.folder, "left"), setting.course.start_pose(setting.vehicle)
-        ahead, aside = float(path.x_m[0]) - pose.x_m, float(path.y_m[0]) - pose.y_m
-        heading = float(path.yaw_rad[0]) - pose.yaw_rad
-        changes["start"] = scenario.start.model_copy(
-            update={"ahead_m": (ahead, ahead), "aside_m": (aside, aside), "heading_rad": (heading, heading)}
-        )
-    return scenario.model_copy(update=changes)
+        plant = plant.model_copy(update={"unknown": {**plant.unknown, "command_latency_samples": (late, late)}})
+    path, pose = load_path(setting.folder, "left"), setting.course.start_pose(setting.vehicle)
+    ahead, aside = float(path.x_m[0]) - pose.x_m, float(path.y_m[0]) - pose.y_m
+    heading = float(path.yaw_rad[0]) - pose.yaw_rad
+    start = {"ahead_m": (ahead, ahead), "aside_m": (aside, aside), "heading_rad": (heading, heading)}
+    return scenario.model_copy(update={"plant": plant, "start": scenario.start.model_copy(update=start)})
 
 
 def _leg_run(
-    setting: Manoeuvre, law: str, sign: str, delay: Delay, run: LockstepRun, truth: Truth, leg: Leg, is_last: bool
-) -> LegRun:
+    setting: Manoeuvre, law: str, sign: str, delay: Delay, part: str, run: LockstepRun, truth: Truth, leg: Leg,
+    is_last: bool,
+) -> LegRun:  # fmt: skip
     rows = leg.rows
     e_y, cross, station = centre_errors(
         setting.tracks[leg.direction], truth, rows, leg.direction, setting.vehicle.cg_to_rear_axle_m
     )
     # The last leg of a run that ends early is the one in which the controller stopped the car.
-    stopped = is_last and not run.controller["completed"]
+    stopped = is_last and run.controller["mode"] == MODE_FAULT
     later = station > START_M
     rate = np.abs(np.diff(truth.road_wheel_angle_cmd_rad[rows], prepend=truth.road_wheel_angle_cmd_rad[rows.start]))
     row = LegRow(
@@ -174,6 +212,7 @@ def _leg_run(
         float(station[-1]),
         not stopped,
         int(run.controller["reason"]) if stopped else 0,
+        part,
     )
     return LegRun(row, station, e_y, cross, truth.road_wheel_angle_rad[rows])
 

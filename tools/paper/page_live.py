@@ -19,7 +19,9 @@ def controller(study: Study, picture: Picture) -> str:
     for direction, printed in ((FORWARD, TABLE_5), (REVERSE, TABLE_6)):
         for law, name in NAMES.items():
             continuous = study.results[printed][name].figures
-            bus, later = (in_lockstep.find(study.lockstep, law, PRINTED, delay, direction) for delay in (BUS, LATE))
+            bus, later = (
+                in_lockstep.find(study.lockstep.legs, law, PRINTED, delay, direction) for delay in (BUS, LATE)
+            )
             on_bus.append(
                 (
                     f"{name}, {direction}",
@@ -29,7 +31,7 @@ def controller(study: Study, picture: Picture) -> str:
             )
             late.append((f"{name}, {direction}", _three(bus), _three(later), _rate(bus), _rate(later)))
     for law, name in (*NAMES.items(), (CAR, "law of this project")):
-        leg = in_lockstep.find(study.lockstep, law, CORRECTED, BUS, REVERSE)
+        leg = in_lockstep.find(study.lockstep.legs, law, CORRECTED, BUS, REVERSE)
         if leg is not None:
             row = leg.row
             end = "~comes to its stop" if row.is_complete else f"!stopped after {row.travelled_m:.1f} m"
@@ -43,9 +45,11 @@ def controller(study: Study, picture: Picture) -> str:
                     f"{row.max_steer_rad:.2f}",
                 )
             )
-    of_car = [in_lockstep.find(study.lockstep, CAR, CORRECTED, LATE, direction) for direction in (FORWARD, REVERSE)]
+    of_car = [
+        in_lockstep.find(study.lockstep.legs, CAR, CORRECTED, LATE, direction) for direction in (FORWARD, REVERSE)
+    ]
     worst = max((1e3 * leg.row.max_rear_cross_track_m for leg in of_car if leg is not None), default=float("nan"))
-    reason = next((in_lockstep.reason_text(r.row) for r in study.lockstep if not r.row.is_complete), "")
+    reason = next((in_lockstep.reason_text(r.row) for r in study.lockstep.legs if not r.row.is_complete), "")
     return "".join(
         [
             note(
@@ -89,6 +93,19 @@ def controller(study: Study, picture: Picture) -> str:
                 "and one sample later, forward; in reverse with the corrected sign, the true error of the three laws.",
             ),
             table(
+                "Forward with one real part that no law here knows: max e<sub>y</sub> (mm) / rms (mm) / angle (rad)",
+                ("eq. 11 with", *NAMES.values()),
+                _parts(study),
+            ),
+            note(
+                WRONG,
+                "An observer of 100 rad/s leaves no room for a car. The PID alone hardly notices a lag, a rack's rate "
+                "or tyres that build up their force over a distance; with the observer the loop swings (red: an rms "
+                "more than three times that on eq. 11), or the car is stopped because its steering does not follow.",
+            )
+            if study.lockstep.with_part
+            else "",
+            table(
                 "Reverse with the corrected sign, in the controller",
                 (
                     "law",
@@ -113,7 +130,7 @@ def controller(study: Study, picture: Picture) -> str:
 
 def _one_sample(study: Study) -> str:
     pairs = [
-        tuple(in_lockstep.find(study.lockstep, "paper", PRINTED, delay, direction) for delay in (BUS, LATE))
+        tuple(in_lockstep.find(study.lockstep.legs, "paper", PRINTED, delay, direction) for delay in (BUS, LATE))
         for direction in (FORWARD, REVERSE)
     ]
     times = [late.row.rms_e_y_m / bus.row.rms_e_y_m for bus, late in pairs if bus is not None and late is not None]
@@ -122,10 +139,26 @@ def _one_sample(study: Study) -> str:
     return f"One sample more makes the rms e<sub>y</sub> of PID + DOB {min(times):.0f} times as large."
 
 
+def _parts(study: Study) -> list[tuple[str, ...]]:
+    parts: dict[str, dict[str, LegRun]] = {}
+    for leg in study.lockstep.with_part:
+        parts.setdefault(leg.row.part, {})[leg.row.law] = leg
+    rows = []
+    for part, legs in parts.items():
+        cells = []
+        for law in NAMES:
+            leg, plain = legs.get(law), in_lockstep.find(study.lockstep.legs, law, PRINTED, BUS, FORWARD)
+            text = _three(leg)
+            is_worse = leg is not None and plain is not None and leg.row.rms_e_y_m > 3.0 * plain.row.rms_e_y_m
+            cells.append(f"!{text}" if is_worse and not text.startswith("!") else text)
+        rows.append((part, *cells))
+    return rows
+
+
 def _three(leg: LegRun | None) -> str:
     if leg is None:
         return "!did not come to it"
-    return three(leg.row) if leg.row.is_complete else f"!{three(leg.row)}, stopped"
+    return three(leg.row) if leg.row.is_complete else f"!{three(leg.row)}, stopped after {leg.row.travelled_m:.1f} m"
 
 
 def _rate(leg: LegRun | None) -> str:

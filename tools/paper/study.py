@@ -13,7 +13,7 @@ from tools.design.waypoints import Floats
 from tools.paper import firmware_law, in_lockstep, path_study, rear_axle
 from tools.paper.firmware_law import FirmwareRun
 from tools.paper.fit import StoredFit, gains_for
-from tools.paper.in_lockstep import LegRun
+from tools.paper.in_lockstep import Runs
 from tools.paper.laws import BOTH, DOB, LAWS, Gains, Law, Observer
 from tools.paper.path_study import AS_PRINTED, VARIANTS, Choice, PathResult
 from tools.paper.plant import CORRECTED as CORRECTED_SIGN
@@ -79,7 +79,7 @@ class Study(NamedTuple):
     rates: Rates
     convergence: dict[float, Figures]
     firmware: list[FirmwareRun]
-    lockstep: list[LegRun]
+    lockstep: Runs
     observers: dict[Observer, Figures]
 
 

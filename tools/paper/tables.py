@@ -134,7 +134,8 @@ def as_json(study: Study) -> dict[str, Any]:
             }
             for run in study.firmware
         ],
-        "lockstep": [run.row._asdict() for run in study.lockstep],
+        "lockstep": [run.row._asdict() for run in study.lockstep.legs],
+        "lockstep_with_real_parts": [run.row._asdict() for run in study.lockstep.with_part],
         "checks": [check._asdict() for check in checks(study)],
     }
 
@@ -187,7 +188,9 @@ def lockstep_checks(study: Study) -> list[Check]:
     found = []
     for direction in (FORWARD, REVERSE):
         legs = {
-            (law, delay): find(study.lockstep, law, PRINTED, delay, direction) for law in NAMES for delay in (BUS, LATE)
+            (law, delay): find(study.lockstep.legs, law, PRINTED, delay, direction)
+            for law in NAMES
+            for delay in (BUS, LATE)
         }
         if None in legs.values():
             continue

@@ -215,7 +215,7 @@ def in_controller(study: Study, stem: Path) -> None:
     """The laws in the controller: PID + DOB on the bus and one sample later; reverse with the corrected sign."""
     figure, axes = sheet(1, 3, width=14.5, height=4.0)
     for delay, colour in ((LATE, RED), (BUS, BLUE)):
-        leg = find(study.lockstep, "paper", PRINTED, delay, FORWARD)
+        leg = find(study.lockstep.legs, "paper", PRINTED, delay, FORWARD)
         if leg is not None:
             s, e, steer = thin(leg.station_m, leg.e_y_m, leg.steer_rad, most=3000)
             name = f"{delay.total_ms:g} ms: rms {1e3 * leg.row.rms_e_y_m:.2g} mm"
@@ -227,13 +227,13 @@ def in_controller(study: Study, stem: Path) -> None:
         low, high = one.get_ylim()
         one.set_ylim(low - 0.25 * (high - low), high)
     for law, name, colour in (("dob", DOB, GREEN), ("pid", PID, ORANGE), ("paper", BOTH, BLUE)):
-        leg = find(study.lockstep, law, CORRECTED, BUS, REVERSE)
+        leg = find(study.lockstep.legs, law, CORRECTED, BUS, REVERSE)
         if leg is not None:
             s, error = thin(leg.station_m, leg.cross_track_error_m)
             axes[2].plot(s, 1e3 * error, color=colour, label=name)
             if not leg.row.is_complete:
                 axes[2].plot(s[-1], 1e3 * error[-1], "x", color=colour, ms=9, mew=2)
-    leg = find(study.lockstep, CAR, CORRECTED, BUS, REVERSE)
+    leg = find(study.lockstep.legs, CAR, CORRECTED, BUS, REVERSE)
     if leg is not None:
         s, error = thin(leg.station_m, leg.cross_track_error_m)
         axes[2].plot(s, 1e3 * error, color=INK, label="law of this project")
