@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 
 # As in tools/cli.py: small matrices, and the test workers share the cores already.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Started in a shell's background, Ctrl-C is ignored, and so it would be by every process that the tests start.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)

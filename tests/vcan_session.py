@@ -252,7 +252,7 @@ def lead_in(lines: list[str]) -> list[str]:
         for before in range(1, count + 1):
             # Of the sensors a different one each time, as of one alone the estimator would learn the noise.
             payload = bytearray(data if name == "020" else kept[before % len(kept)][1])
-            payload[1] = payload[1] & 0xF0 | (data[1] - before) % 15
+            payload[1] = payload[1] & 0xF0 | ((data[1] & 0x0F) - before) % 15
             payload[0] = crc8(int(name, 16), payload)
             made.append((start_s - before * period_s, name, payload))
     return [f"({time_s:.6f}) vcan0 {name}#{payload.hex().upper()}" for time_s, name, payload in sorted(made)]
