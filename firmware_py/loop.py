@@ -150,7 +150,9 @@ class Loop:
         self._bus = bus
         self._rates = rates
         punctual = realtime.fifo and self._clock.slow_motion == 1
-        self._pace = Pace(self._clock, SPIN_NS, node.rehearse if rehearses else None) if punctual else Pace(self._clock)
+        # A single CPU belongs to the others until the deadline.
+        rehearse = node.rehearse if rehearses and punctual and (os.cpu_count() or 1) > 1 else None
+        self._pace = Pace(self._clock, SPIN_NS if punctual else 0, rehearse)
         self._realtime = realtime
         self._once = once
         self._status_fd = status_fd
