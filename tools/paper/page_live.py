@@ -29,7 +29,7 @@ def controller(study: Study, picture: Picture) -> str:
                     *_cells(bus),
                 )
             )
-            late.append((f"{name}, {direction}", _three(bus), _three(later), _rate(bus), _rate(later)))
+            late.append((f"{name}, {direction}", _three(bus), _against(later, bus), _rate(bus), _rate(later)))
     for law, name in (*NAMES.items(), (CAR, "law of this project")):
         leg = in_lockstep.find(study.lockstep.legs, law, CORRECTED, BUS, REVERSE)
         if leg is not None:
@@ -145,14 +145,16 @@ def _parts(study: Study) -> list[tuple[str, ...]]:
         parts.setdefault(leg.row.part, {})[leg.row.law] = leg
     rows = []
     for part, legs in parts.items():
-        cells = []
-        for law in NAMES:
-            leg, plain = legs.get(law), in_lockstep.find(study.lockstep.legs, law, PRINTED, BUS, FORWARD)
-            text = _three(leg)
-            is_worse = leg is not None and plain is not None and leg.row.rms_e_y_m > 3.0 * plain.row.rms_e_y_m
-            cells.append(f"!{text}" if is_worse and not text.startswith("!") else text)
-        rows.append((part, *cells))
+        plain = {law: in_lockstep.find(study.lockstep.legs, law, PRINTED, BUS, FORWARD) for law in NAMES}
+        rows.append((part, *(_against(legs.get(law), plain[law]) for law in NAMES)))
     return rows
+
+
+def _against(leg: LegRun | None, plain: LegRun | None) -> str:
+    """The cell of a leg, marked where it is much worse than a plain one."""
+    text = _three(leg)
+    is_worse = leg is not None and plain is not None and leg.row.rms_e_y_m > 3.0 * plain.row.rms_e_y_m
+    return f"!{text}" if is_worse and not text.startswith("!") else text
 
 
 def _three(leg: LegRun | None) -> str:
