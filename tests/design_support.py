@@ -72,12 +72,14 @@ class FirmwareLaw:
         pose_x_m = self.poses_x[-1 - latency]
         self.state = estimator.estimate(leg, car, self.gains, self.state, motion, 1, pose_x_m, e_m, yaw_rad, latency)
         assert self.state.disbelieved == 0
-        _, e, heading = predictor.predict(leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S)
+        _, e, heading, wheels_rad = predictor.predict(leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S)
         if not self.mode.predicts:
             e, heading = self.state.cross_track_error_m, self.state.heading_error_rad
         feedback = pid.feedback_1pm(e, heading, self.integral_m2, self.gains, sigma)
-        angle = math.atan(-car.wheelbase_m * feedback)
-        angle = (angle - self.state.road_disturbance_rad - self.state.steering_offset_rad) / self.state.steering_gain
+        angle = math.atan(-car.wheelbase_m * feedback) - self.state.road_disturbance_rad
+        if self.mode.predicts:
+            angle += pid.push_rad(angle - wheels_rad, car)
+        angle = (angle - self.state.steering_offset_rad) / self.state.steering_gain
         preview = pid.preview_error_m(e, heading, self.gains.preview_m, sigma)
         self.integral_m2 = pid.integrate_m2(self.integral_m2, preview, ds_m, self.gains, 0)
         self.sent_rad = (angle, *self.sent_rad[:-1])

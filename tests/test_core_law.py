@@ -144,6 +144,26 @@ def test_the_integral_stands_still_while_limited_and_stays_within_its_authority(
     assert gains.ki * integral == pytest.approx(pid.INTEGRAL_AUTHORITY_1PM)
 
 
+@pytest.mark.parametrize("lag_s", [0.05, 0.1, 0.3])
+def test_the_push_makes_steerings_of_any_lag_as_much_faster(lag_s):
+    """A step of the wanted angle by a steering with a lag that the tables do not know."""
+    car = shipped_tables().car
+    angle_rad, pushed_rad = 0.0, 0.0
+    step_s = 1e-4
+    for _ in range(round(lag_s / step_s)):
+        angle_rad += step_s / lag_s * (0.01 - angle_rad)
+        pushed_rad += step_s / lag_s * (0.01 + pid.push_rad(0.01 - pushed_rad, car) - pushed_rad)
+    assert angle_rad == pytest.approx(0.01 * (1.0 - math.exp(-1.0)), rel=1e-2)
+    assert pushed_rad == pytest.approx(0.01 * (1.0 - math.exp(-1.5)), rel=1e-2)
+
+
+def test_wheels_that_stand_as_wanted_and_a_steering_without_lag_get_no_push():
+    car = shipped_tables().car
+    assert pid.push_rad(0.0, car) == 0.0
+    assert pid.push_rad(0.01, car) > 0.0
+    assert pid.push_rad(0.01, car._replace(lag_alpha=1.0)) == 0.0
+
+
 def test_the_right_side_is_the_exact_mirror_of_the_left():
     left, right = shipped_tables("left"), shipped_tables("right")
     rng = random.Random(5)

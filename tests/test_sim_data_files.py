@@ -313,7 +313,11 @@ MASS = "mass_kg = { nominal = 3000.0, low = 2100.0, high = 3900.0"
             'name = "Paper Car"',
             "name = 'Paper Car': string should match pattern '^[a-z0-9][a-z0-9_-]{0,39}$'",
         ),
-        ("[parameters]", "colour = 1\n[parameters]", "colour: unknown key; known here: name, description, parameters"),
+        (
+            "[parameters]",
+            "colour = 1\n[parameters]",
+            "colour: unknown key; known here: name, description, parameters, design",
+        ),
         (
             "cg_to_rear_axle_m = { nominal = 2.0, low = 2.0, high = 2.0",
             "cg_to_rear_axle_m = { nominal = 4.5, low = 2.0, high = 4.5",
@@ -323,6 +327,17 @@ MASS = "mass_kg = { nominal = 3000.0, low = 2100.0, high = 3900.0"
             "mirror_width_m = { nominal = 2.0, low = 2.0, high = 2.0",
             "mirror_width_m = { nominal = 1.9, low = 1.9, high = 2.0",
             "parameters.mirror_width_m = 1.9: is the width over the mirrors, so at least body_width_m = 2.0",
+        ),
+        (
+            "slowest_pole_1pm = -0.08",
+            "slowest_pole_1pm = 0.08",
+            "design.slowest_pole_1pm = 0.08: input should be less than 0",
+        ),
+        (
+            "least_damping = 0.1",
+            "damping = 0.1",
+            "design.damping: unknown key; known here: slowest_pole_1pm, least_damping, least_disk_margin, "
+            "least_delay_margin_samples",
         ),
     ],
 )

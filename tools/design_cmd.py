@@ -125,11 +125,7 @@ def _paper_study(update: bool) -> int:
 def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | None = None) -> dict[str, Any]:
     """Design, certify, show, and write where a folder is given; nothing is written where the certificate fails."""
     from tools.design import tables  # noqa: PLC0415 -- scipy
-    from tools.design.certificate import (  # noqa: PLC0415 -- scipy
-        LEAST_DELAY_MARGIN_SAMPLES,
-        LEAST_DISK_MARGIN,
-        certify,
-    )
+    from tools.design.certificate import certify  # noqa: PLC0415 -- scipy
 
     report = tables.run_design(vehicle, course)
     certificate = certify(vehicle, report.gains)
@@ -142,12 +138,13 @@ def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | N
         sheet.draw(report, certificate, out / "design.png")
         _write_json(out / "design.json", figures)
         print(f"sheet in {out / 'design.png'}")
+    least = vehicle.criteria
     if not certificate.holds:
         raise UserError(
             f"vehicle {vehicle.name}: the design does not hold in its whole box (disk margin"
-            f" {certificate.min_disk_margin:.2f} must be {LEAST_DISK_MARGIN:g}, delay margin"
-            f" {certificate.min_delay_margin_samples:.1f} samples must be {LEAST_DELAY_MARGIN_SAMPLES:g}, D-stable:"
-            f" {certificate.all_d_stable}); worst: {certificate.worst}"
+            f" {certificate.min_disk_margin:.2f} must be {least.least_disk_margin:g}, delay margin"
+            f" {certificate.min_delay_margin_samples:.1f} samples must be {least.least_delay_margin_samples:g},"
+            f" D-stable: {certificate.all_d_stable}); worst: {certificate.worst}"
         )
     if folder is not None:
         tables.write_tables(report, folder)

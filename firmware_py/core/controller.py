@@ -40,6 +40,9 @@ PERIOD_S = 0.01
 REPORT_AGE_S = 0.003
 """How long before the cycle the reports of a cycle are sampled, as agreed for the bus; the law works at any phase."""
 
+MEAN_AGE_S = REPORT_AGE_S + 0.5 * PERIOD_S
+"""From the reports to the middle of the cycle in which the command stands."""
+
 LONGEST_CYCLE_S = 0.1
 """After a longer pause the odometry is not integrated further: the vehicle's watchdog has stopped the car by then."""
 
@@ -135,7 +138,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         inputs.attitude.yaw_rad,
         car.pose_latency_samples if tables.law == LAW_CAR else 0,
     )
-    station_m, cross_m, heading_rad = predictor.predict(
+    station_m, cross_m, heading_rad, angle_rad = predictor.predict(
         leg, car, estimated, state.sent_angles_rad, travel_mps, PERIOD_S
     )
     if tables.law != LAW_CAR:
@@ -143,7 +146,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         heading_rad = estimated.heading_error_rad
 
     # Steering: feedforward + PID - disturbance, within the limits.
-    feedforward_1pm, slope_1pm2 = feedforward_at(leg, station_m + travel_mps * (REPORT_AGE_S + 0.5 * PERIOD_S))
+    feedforward_1pm, slope_1pm2 = feedforward_at(leg, station_m + travel_mps * MEAN_AGE_S)
     feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral_m2, gains, leg.sigma)
     wanted_rad = _steering(
         car,
@@ -151,9 +154,11 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         slope_1pm2,
         feedback_1pm,
         travel_mps,
+        estimated.road_disturbance_rad,
+        angle_rad,
+        tables.law,
     )
-    wanted_rad -= estimated.road_disturbance_rad + estimated.steering_offset_rad
-    wanted_rad /= estimated.steering_gain
+    wanted_rad = (wanted_rad - estimated.steering_offset_rad) / estimated.steering_gain
     paper = state.paper
     if tables.law == LAW_PAPER:
         pose_is_new = health_state.pose_is_new
@@ -291,12 +296,21 @@ def _steering(
     slope_1pm2: float,
     correction_1pm: float,
     travel_mps: float,
+    road_disturbance_rad: float,
+    angle_rad: float,
+    law: int,
 ) -> float:
-    """Return the wanted road-wheel angle: feedforward less correction (1/m), ahead of the actuator's lag."""
+    """Return the road-wheel angle to command: feedforward less correction (1/m), ahead of the actuator's lag.
+
+    `angle_rad` is the wheels' angle when the command begins to act; the law `car` pushes them on by what they lack.
+    """
     reference = car.wheelbase_m * feedforward_1pm
-    angle_rad = math.atan(reference - car.wheelbase_m * correction_1pm)
+    wanted_rad = math.atan(reference - car.wheelbase_m * correction_1pm) - road_disturbance_rad
     rate_radps = travel_mps * car.wheelbase_m * slope_1pm2 / (1.0 + reference * reference)
-    return angle_rad + car.steering_lag_s * rate_radps
+    ahead_rad = wanted_rad + car.steering_lag_s * rate_radps
+    if law == LAW_CAR:
+        ahead_rad += pid.push_rad(wanted_rad - rate_radps * MEAN_AGE_S - angle_rad, car)
+    return ahead_rad
 
 
 def _paper_steering(

@@ -12,8 +12,10 @@ def predict(
     sent_angles_rad: tuple[float, ...],
     travel_speed_mps: float,
     period_s: float,
-) -> tuple[float, float, float]:
-    """Return station (m), cross-track error (m) and heading error (rad) when a command that is sent now begins to act.
+) -> tuple[float, float, float, float]:
+    """Return where the car is when a command that is sent now begins to act.
+
+    Station (m), cross-track error (m), heading error (rad) and road-wheel angle (rad, as it is measured).
 
     `sent_angles_rad[0]` is the newest command on its way. The commands that are still to act are the last
     (command latency) of them; the speed is taken as constant over that time.
@@ -40,4 +42,4 @@ def predict(
             travel_speed_mps,
             period_s,
         )
-    return station_m, cross_m, heading_rad
+    return station_m, cross_m, heading_rad, angle_rad

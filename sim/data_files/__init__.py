@@ -23,7 +23,7 @@ from sim.data_files.course import (
 )
 from sim.data_files.reading import FOLDERS, ROOT, find_file, shipped_names
 from sim.data_files.scenario import Draw, PlantDeviation, Scenario, Sensors, StartOffset, load_scenario, true_vehicle
-from sim.data_files.vehicle import PARAMETERS, Parameter, Vehicle, check_parameters, load_vehicle
+from sim.data_files.vehicle import PARAMETERS, Criteria, Parameter, Vehicle, check_parameters, load_vehicle
 
 __all__ = [
     "FOLDERS",
@@ -32,6 +32,7 @@ __all__ = [
     "SIDES",
     "Cone",
     "Course",
+    "Criteria",
     "Draw",
     "MistakeRule",
     "Parameter",

@@ -7,7 +7,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Annotated, NamedTuple, get_type_hints
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from sim.data_files.reading import STRICT, Finite, Name, Text, find_file, read_toml, shown, shown_key, validate
 from sim.errors import UserError
@@ -21,12 +21,27 @@ class Parameter(NamedTuple):
     maximum: float
 
 
+class Criteria(BaseModel):
+    """What the design must keep with every car of the box; the table `design` of a vehicle file.
+
+    D-region of the closed loop's poles: none slower than `slowest_pole_1pm` per metre of travel, and all damped at
+    least by `least_damping`. Margins of the loop cut at the steering command: the balanced disk margin, and the delay
+    in samples of 10 ms beyond the car's own.
+    """
+
+    model_config = STRICT
+    slowest_pole_1pm: Annotated[Finite, Field(ge=-1.0, lt=0.0)] = -0.08
+    least_damping: Annotated[Finite, Field(gt=0.0, le=0.7)] = 0.1
+    least_disk_margin: Annotated[Finite, Field(gt=0.0, le=1.5)] = 0.5
+    least_delay_margin_samples: Annotated[Finite, Field(ge=0.0, le=100.0)] = 10.0
+
+
 @dataclass(frozen=True)
 class Vehicle:
     """A car: nominal parameters in SI units, `box[name] = (low, high)` around each, and the hash for the bus.
 
-    Rear axle, centre of gravity and bumpers lie on the x axis of the body. `overlay` holds the nominal values that
-    a scenario has put in place of the file's.
+    Rear axle, centre of gravity and bumpers lie on the x axis of the body. `criteria` is what a design for the car must
+    keep. `overlay` holds the nominal values that a scenario has put in place of the file's.
     """
 
     name: str
@@ -57,6 +72,7 @@ class Vehicle:
     max_decel_mps2: Annotated[float, Parameter("m/s^2", 2.4, 10.0)]
     box: Mapping[str, tuple[float, float]]
     file_bytes: bytes = field(repr=False)
+    criteria: Criteria = field(default_factory=Criteria)
     overlay: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -140,6 +156,7 @@ class _VehicleFile(BaseModel):
     name: Name
     description: Text
     parameters: dict[str, _Entry]
+    design: Criteria = Criteria()
 
 
 def load_vehicle(name_or_path: str | Path, overlay: Mapping[str, float] | None = None) -> Vehicle:
@@ -173,6 +190,7 @@ def load_vehicle(name_or_path: str | Path, overlay: Mapping[str, float] | None =
         description=file.description,
         box={key: (file.parameters[key].low, file.parameters[key].high) for key in PARAMETERS},
         file_bytes=raw,
+        criteria=file.design,
         **nominal,  # type: ignore[arg-type]
     )
     _check_whole(vehicle, where)

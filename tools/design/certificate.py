@@ -19,18 +19,13 @@ RESOLUTION = 600
 """Frequencies a loop is computed at; margins lie within 2 % of those on ten times as many."""
 
 
-LEAST_DISK_MARGIN = 0.5
-LEAST_DELAY_MARGIN_SAMPLES = 10.0
-"""What every car of a vehicle's box must keep with the law `car`, or there are no tables for the vehicle."""
-
-
 class Certificate(NamedTuple):
     """The smallest margins of all loops of the law `car`, and where the disk margin is smallest.
 
     Delay in samples of 10 ms beyond the car's own; gain as the factor, up or down, that ends stability; the disk margin
     is the balanced one (any mixture of gain and phase). A loop that is not stable has margins of 0 (gain: 1). D-stable:
-    every pole of every loop is in the D-region of `tools.design.gains`, those of `others` included. `holds`: D-stable
-    with at least the least margins.
+    every pole of every loop is in the D-region, those of `others` included. `holds`: D-stable with at least the margins
+    that the vehicle's file asks for (`Criteria`), or there are no tables for the vehicle.
 
     `others` holds the same figures for what is not the usual: the law without the yaw rate, and the other laws.
     `by_speed` has the smallest disk margin and delay margin of each (direction, speed in m/s).
@@ -61,7 +56,6 @@ UNSTABLE = Margins(0.0, 0.0, 1.0, 0.0)
 
 def certify(vehicle: Vehicle, gains: dict[str, list[tuple[float, ...]]]) -> Certificate:
     """Certify gain tables (`tools.design.gains.design_gains`) for a vehicle."""
-    nominal = model.nominal_of(vehicle)
     cars = criteria.corners(vehicle)
     top_mps = criteria.checked_speeds(vehicle)[-1]
     found: dict[str, list[_Found]] = {}
@@ -71,15 +65,15 @@ def certify(vehicle: Vehicle, gains: dict[str, list[tuple[float, ...]]]) -> Cert
         at = criteria.cars_at_speed(cars, first.speed_mps, first.direction, criteria.on_circle(omega))
         for law, rows in tables.items():
             for mode in criteria.MODES[law]:
-                found.setdefault(_name_of(law, mode), []).append(_found(rows[index], nominal, mode, at, omega))
+                found.setdefault(_name_of(law, mode), []).append(_found(rows[index], vehicle, mode, at, omega))
     usual = found.pop("car")
     figures = _figures(usual)
     all_d_stable = all(here.d_stable for some in (usual, *found.values()) for here in some)
     return Certificate(
         **{**figures, "all_d_stable": all_d_stable},
         holds=all_d_stable
-        and figures["min_disk_margin"] >= LEAST_DISK_MARGIN
-        and figures["min_delay_margin_samples"] >= LEAST_DELAY_MARGIN_SAMPLES,
+        and figures["min_disk_margin"] >= vehicle.criteria.least_disk_margin
+        and figures["min_delay_margin_samples"] >= vehicle.criteria.least_delay_margin_samples,
         others={name: _figures(some) for name, some in found.items()},
         by_speed=[(here.direction, here.speed_mps, here.least.disk, here.least.delay_samples) for here in usual],
     )
@@ -99,14 +93,14 @@ def _name_of(law: str, mode: model.Mode) -> str:
     return law if mode == criteria.MODES[law][0] else f"{law}, without the yaw rate"
 
 
-def _found(row: Row, nominal: model.Nominal, mode: model.Mode, at: criteria.CarsAtSpeed, omega: Floats) -> _Found:
-    law = model.controller(row, nominal, mode)
+def _found(row: Row, vehicle: Vehicle, mode: model.Mode, at: criteria.CarsAtSpeed, omega: Floats) -> _Found:
+    law = model.controller(row, model.nominal_of(vehicle), mode)
     all_margins = []
     d_stable = True
     for plant, loop in zip(at.plants, model.loops(law, at.answers, at.z), strict=True):
         matrix = model.closed_loop(law, plant)
         stable = model.is_stable(matrix)
-        d_stable = d_stable and stable and criteria.d_stable(matrix, row.speed_mps)
+        d_stable = d_stable and stable and criteria.d_stable(matrix, row.speed_mps, vehicle.criteria)
         all_margins.append(margins_of(loop, omega) if stable else UNSTABLE)
     worst = min(range(len(all_margins)), key=lambda car: all_margins[car].disk)
     return _Found(

@@ -5,7 +5,7 @@ estimator's gains are steady-state Kalman gains: process noise per root metre an
 sample, so that a slowly travelled metre is averaged over more poses and the gains depend on the speed. The PID is one
 pattern of poles per metre (`pid_gains`), scaled by a pace. At every speed of the grid the pace is the largest one, up
 to the law's own, with which the nominal car and every corner of the vehicle's box keep their poles in the D-region
-(`d_stable`) and a disk margin of at least `LEAST_DISK_MARGIN`.
+(`d_stable`) and their disk margin (`least_disk_margin`), both with a reserve over what the vehicle's file asks for.
 """
 
 import itertools
@@ -18,7 +18,7 @@ import numpy as np
 
 from firmware_py.core.estimator import ODOMETRY_LENGTH
 from firmware_py.core.motion import QUEUE_LENGTH
-from sim.data_files import Vehicle
+from sim.data_files import Criteria, Vehicle
 from sim.errors import UserError
 from tools.design import model
 from tools.design.model import Complexes, Floats, Mode, Row
@@ -52,8 +52,9 @@ yaw rate does not show (rad), per root metre of travel."""
 ROAD_WALK_1PM = 0.5e-3
 """Change of the road disturbance per root metre: the play of the steering goes from one side to the other."""
 
-OFFSET_LENGTH_M = 2.0
-"""Way over which the steering offset is learnt: long against what an unknown lag of the steering looks like."""
+OFFSET_LENGTH_M = 6.0
+"""Way over which the steering offset is learnt: long against what an unknown lag of the steering looks like, whose gap
+would be taken for an offset in every bend."""
 
 DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
 """Without the yaw rate: noise of cross-track error (m), heading (rad) and road disturbance (1/m) per root metre. The
@@ -62,30 +63,26 @@ last stands for steering bias, steering gain and tyres, whose effect changes as 
 OBSERVER_PACES = (0.8, 0.65, 0.5, 0.4, 0.3)
 """Observers tried without the yaw rate: process noise of `DISTURBANCE` with its poles moved by about these factors."""
 
-PREVIEW_S = 0.5
+PREVIEW_S = 0.2
 """The preview distance in seconds of travel."""
 
-FASTEST_PACE = {"car": 1.4, "pid_ff": 0.65}
-"""Largest pace of the PID: above it the pose's noise costs more than the quicker answer gains. Unfiltered, that noise
-saturates the steering's rate, which no linear margin shows: twice this pace loses a 4 m wheelbase off the path."""
+FASTEST_PACE = {"car": 1.25, "pid_ff": 0.65}
+"""Largest pace of the PID: above it the delay margin shrinks and the pose's noise costs more than the quicker answer
+gains. Unfiltered, that noise saturates the steering's rate, which no linear margin shows: twice this pace loses a 4 m
+wheelbase off the path."""
 
 SLOWEST_PACE = 0.3
 """Below it a start off the path would not be corrected within a leg."""
 
-LEAST_DISK_MARGIN = {"car": 0.6, "pid_ff": 0.34}
-"""Of every car in the box: 0.6 is 1.86 times the steering gain or 33 degrees of phase, whatever mixture of both."""
+RESERVE = 1.2
+"""The gains' disk margin and damping over what the vehicle's file asks for: what is blended between two rows has a
+little less than they, and a finer grid of frequencies finds a little less."""
+
+LEAST_DISK_MARGIN_OF_PLAIN = 0.34
+"""Of the law `pid_ff`, which is there to compare with: 1.4 times the steering gain or 19 degrees of phase."""
 
 LEAST_DISK_MARGIN_WITHOUT_YAW_RATE = 0.34
 """For the rest of a run in which the yaw rate has gone missing: 1.4 times the gain or 19 degrees."""
-
-SLOWEST_POLE_1PM = -0.08
-"""Every pole decays within 12 m of travel, the shorter leg."""
-
-LEAST_DAMPING = 0.1
-"""Of every pole of every car in the box; the nominal car has far more, and the disk margin mostly asks for more."""
-
-BLEND_RESERVE = 1.2
-"""The rows' damping over the least one: what is blended between two rows has a little less than they."""
 
 QUICK_1PS = 10.0
 """Poles that decay faster, within 0.1 s, belong to delay chain and lag and need no damping."""
@@ -95,8 +92,12 @@ GAIN_SPREAD = 0.1
 
 
 def pid_gains(pace: float) -> tuple[float, float, float]:
-    """PID gains kp (1/m^2), ki (1/m^3), kd (1/m) whose poles per metre are those of (2, 0.4, 2.5) times the pace."""
-    return 2.0 * pace**2, 0.4 * pace**3, 2.5 * pace
+    """PID gains kp (1/m^2), ki (1/m^3), kd (1/m) whose poles per metre are those of (3, 0.8, 2.7) times the pace.
+
+    With the preview at full speed the two poles of the error fall together: what pushes the car aside while it points
+    along the path, as the slip of the rear tyres does, leaves an error of kd / kp times its angle.
+    """
+    return 3.0 * pace**2, 0.8 * pace**3, 2.7 * pace
 
 
 def observer_noise(pace: float) -> tuple[float, float, float]:
@@ -289,13 +290,21 @@ def disk_margin(loop: Complexes) -> Floats:
     return np.asarray(2.0 * np.min(np.abs((1.0 + loop) / (1.0 - loop)), axis=-1))
 
 
-def d_stable(matrix: Floats, speed_mps: float, least_damping: float = LEAST_DAMPING) -> bool:
-    """Whether all poles of a closed loop lie in the D-region: fast enough per metre of travel, and damped."""
+def d_stable(matrix: Floats, speed_mps: float, criteria: Criteria, reserve: float = 1.0) -> bool:
+    """Whether all poles of a closed loop lie in the D-region: fast enough per metre of travel, and damped.
+
+    `reserve` is the factor on the least damping.
+    """
     poles = model.poles_1pm(matrix, speed_mps)
-    if float(poles.real.max()) > SLOWEST_POLE_1PM:
+    if float(poles.real.max()) > criteria.slowest_pole_1pm:
         return False
     slow = poles[poles.real > -QUICK_1PS / speed_mps]
-    return bool(np.all(-slow.real >= least_damping * np.abs(slow)))
+    return bool(np.all(-slow.real >= reserve * criteria.least_damping * np.abs(slow)))
+
+
+def least_disk_margin(vehicle: Vehicle, law: str) -> float:
+    """Disk margin that the gains of a law keep with every car of the box."""
+    return RESERVE * vehicle.criteria.least_disk_margin if law == "car" else LEAST_DISK_MARGIN_OF_PLAIN
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -353,7 +362,6 @@ def cars_at_speed(cars: Sequence[model.Corner], speed_mps: float, direction: flo
 
 def choose(vehicle: Vehicle, law: str) -> Schedule:
     """The quickest schedule of a vehicle and law whose cars all survive; UserError where there is none."""
-    nominal = model.nominal_of(vehicle)
     cars = corners(vehicle, softest_tyres=True)
     checked = checked_speeds(vehicle)
     at = {speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked}
@@ -364,11 +372,11 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
 
         def survives(pace: float, speed: float = speed) -> bool:
             row = row_of(law, 1.0, speed, pace, OBSERVER_PACES[0])
-            return _survives(row, nominal, usual, at[speed], LEAST_DISK_MARGIN[law])
+            return _survives(row, vehicle, usual, at[speed], least_disk_margin(vehicle, law))
 
         pace = _largest(survives, SLOWEST_PACE, FASTEST_PACE[law])
         if pace is None:
-            raise UserError(_why_not(vehicle, nominal, law))
+            raise UserError(_why_not(vehicle, law))
         paces.append(pace)
     paces.reverse()
     observer_pace = OBSERVER_PACES[0]
@@ -380,7 +388,7 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
                 if all(
                     _survives(
                         row_of(law, 1.0, speed, pace, tried),
-                        nominal,
+                        vehicle,
                         mode,
                         at[speed],
                         LEAST_DISK_MARGIN_WITHOUT_YAW_RATE,
@@ -394,12 +402,12 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
     return Schedule(observer_pace, (paces[0], *paces, *(paces[-1],) * beyond))
 
 
-def _survives(row: Row, nominal: model.Nominal, mode: Mode, at: CarsAtSpeed, least_disk_margin: float) -> bool:
-    law = model.controller(row, nominal, mode)
-    if float(disk_margin(model.loops(law, at.answers, at.z)).min()) < least_disk_margin:
+def _survives(row: Row, vehicle: Vehicle, mode: Mode, at: CarsAtSpeed, least_margin: float) -> bool:
+    law = model.controller(row, model.nominal_of(vehicle), mode)
+    if float(disk_margin(model.loops(law, at.answers, at.z)).min()) < least_margin:
         return False
-    least_damping = BLEND_RESERVE * LEAST_DAMPING
-    return all(d_stable(model.closed_loop(law, plant), row.speed_mps, least_damping) for plant in at.plants)
+    matrices = (model.closed_loop(law, plant) for plant in at.plants)
+    return all(d_stable(matrix, row.speed_mps, vehicle.criteria, RESERVE) for matrix in matrices)
 
 
 def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int = 7) -> float | None:
@@ -417,15 +425,16 @@ def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int
     return low
 
 
-def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
+def _why_not(vehicle: Vehicle, law: str) -> str:
     """One line that names the dimension of the box which keeps the softest gains from surviving."""
+    nominal = model.nominal_of(vehicle)
     speed = checked_speeds(vehicle)[-1]
     row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1])
     z = on_circle(frequencies(speed))
     system = model.controller(row, nominal, MODES[law][0])
 
     def margin(car: model.Corner) -> float:
-        if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed):
+        if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed, vehicle.criteria):
             return 0.0
         return float(disk_margin(model.loop_response(system, row, [car], z))[0])
 
@@ -433,7 +442,7 @@ def _why_not(vehicle: Vehicle, nominal: model.Nominal, law: str) -> str:
     worst = min(cars, key=margin)
     # The dimension that helps most when it alone is nominal; where none helps enough, when it alone does not delay.
     blamed = _dimension_that_helps(worst, cars[0], margin)
-    least = LEAST_DISK_MARGIN[law]
+    least = least_disk_margin(vehicle, law)
     if blamed[0] < least:
         ideal = cars[0]._replace(steering_lag_s=0.0, pose_latency_samples=0, command_latency_samples=0.0)
         blamed = _dimension_that_helps(worst, ideal, margin)
