@@ -12,6 +12,7 @@ from firmware_py.bus import Bus, open_bus
 from firmware_py.codec import INPUT_MESSAGES, Codec, load_codec
 from firmware_py.core.controller import PERIOD_S, PERIOD_US
 from firmware_py.core.signals import MODE_FAULT
+from firmware_py.core.tables import LAW_PAPER
 from firmware_py.errors import UserError
 from firmware_py.loop import Clock, Loop, RunResult, status_writer
 from firmware_py.node import ControllerNode, build_tables
@@ -61,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="use of SCHED_FIFO (required on a physical interface, auto on loopbus, virtual and vcan*)",
     )
     parser.add_argument(
-        "--no-rehearsal", action="store_true", help="do not run each cycle's work once before its time (SCHED_FIFO)"
+        "--no-rehearsal", action="store_true", help="do not run each cycle's work twice before its time (SCHED_FIFO)"
     )
     parser.add_argument("--cpu", type=int, metavar="N", help="stay on this CPU")
     parser.add_argument(
@@ -111,6 +112,8 @@ def _run(options: argparse.Namespace) -> int:
         raise UserError("--slow-motion: a car is not checked in slow motion; leave it out with --preflight")
     bus = _open(options, codec)
     try:
+        if bus.is_physical and table_set.law == LAW_PAPER and not options.listen_only:
+            raise UserError(f"--law {options.law}: no car can be reversed by it; drive a car with --law car")
         policy = options.realtime or ("required" if bus.is_physical else "auto")
         if options.preflight:
             return preflight.run(

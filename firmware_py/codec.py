@@ -337,32 +337,38 @@ def _unpack_expression(signal: "Signal") -> str:
 class _Slot:
     """The newest valid values of one message."""
 
-    __slots__ = ("frame_id", "partner", "receive", "receiver", "used", "valid_bits", "values", "waiting")
+    __slots__ = ("frame_id", "partner", "receive", "receiver", "timeout_ns", "used", "valid_bits", "values", "waiting")
 
     def __init__(self, info: MessageInfo, codec: Codec) -> None:
         self.frame_id = info.frame_id
-        self.receiver = e2e.Receiver(info.timeout_ms * 1_000_000)
+        self.timeout_ns = info.timeout_ms * 1_000_000
+        self.receiver = e2e.Receiver(self.timeout_ns)
         self.receive = codec.receive[info.name]
         self.values: Any = codec.unpack[info.name](bytes(FRAME_BYTES))
         self.used = NO_COUNTER
         fields = info.struct._fields
         self.valid_bits = tuple((fields.index(b), fields.index(v)) for b, v in VALID_BITS.get(info.name, ()))
         self.partner: _Slot | None = None
-        self.waiting: tuple[int, Any] | None = None  # counter and values that wait for the partner's frame
+        self.waiting: tuple[int, int, Any] | None = None  # arrival, counter and values: wait for the partner's frame
 
-    def keep(self, counter: int, values: Any) -> None:
-        """Take over the values of a valid frame; a value that says itself that it is invalid is not taken."""
+    def keep(self, now_ns: int, counter: int, values: Any) -> None:
+        """Take over the values of a valid frame; a value that says itself that it is invalid is not taken.
+
+        What has waited for its partner for a timeout is of another sample, whatever its counter says: counters recur.
+        """
         for bit, value in self.valid_bits:
             if not values[bit]:
                 values = values._replace(**{values._fields[value]: self.values[value]})
         if self.partner is None:
             self.values, self.used = values, counter
             return
-        self.waiting = (counter, values)
-        if self.partner.waiting is not None and self.partner.waiting[0] == counter:
-            for slot in (self, self.partner):
-                slot.used, slot.values = slot.waiting or (NO_COUNTER, slot.values)
-                slot.waiting = None
+        other = self.partner
+        if other.waiting is not None and other.waiting[1] == counter and now_ns - other.waiting[0] < self.timeout_ns:
+            self.used, self.values = counter, values
+            _, other.used, other.values = other.waiting
+            self.waiting = other.waiting = None
+        else:
+            self.waiting = (now_ns, counter, values)
 
 
 class Mailbox:
@@ -410,7 +416,7 @@ class Mailbox:
             elif slot.receiver.check(now_ns, counter) != e2e.OK:
                 self.rejected_counter += 1
             else:
-                slot.keep(counter, values)
+                slot.keep(now_ns, counter, values)
                 self.received += 1
 
     def rehearse(self, frames: list[tuple[int, bytes]]) -> None:

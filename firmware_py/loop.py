@@ -80,8 +80,8 @@ class Clock:
 class Pace:
     """Waits for deadlines: sleeps, rehearses, spins.
 
-    `rehearse` is the work that the deadline is for, without any effect; None for none of it, and it must not raise. A
-    rehearsal never makes the deadline late: one begins only where what is left is more than the longest one of late.
+    `rehearse` is the work that the deadline is for, without any effect; None for none of it, and it must not raise. One
+    begins only where what is left is more than the longest one of late: the first that is longer may be late, once.
     """
 
     def __init__(self, clock: Clock, spin_ns: int = 0, rehearse: Callable[[], None] | None = None) -> None:
@@ -288,6 +288,7 @@ class Loop:
             "step_p50_us": self._step.quantile_us(0.5),
             "step_p99_us": self._step.quantile_us(0.99),
             "rehearsals": self._pace.rehearsals,
+            "failed_rehearsals": node.failed_rehearsals,
             "rehearsal_p50_us": self._pace.rehearsal.quantile_us(0.5),
             "scheduler": "SCHED_FIFO" if self._realtime.fifo else "SCHED_OTHER",
             "realtime": self._realtime.steps,

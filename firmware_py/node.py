@@ -1,6 +1,5 @@
 """The controller as a node of the bus: frames in, one cycle of the core, frames out. Reads no clock."""
 
-import contextlib
 from typing import Any, NamedTuple
 
 from firmware_py.codec import Codec, Mailbox, Sender
@@ -28,7 +27,7 @@ from firmware_py.table_file import TableSet
 Frame = tuple[int, bytes]
 
 FAILED_CYCLES = 300
-"""So many failed cycles in a row the vehicle is kept enabled to brake and steer straight on; then it is released."""
+"""So many failed cycles in a row the vehicle is kept enabled to brake with its wheels held; then it is released."""
 
 CYCLE_INDEX_VALUES = 1 << 20
 WAKE_TIME_VALUES = 1 << 32
@@ -84,6 +83,7 @@ class ControllerNode:
         self.cycles = 0
         self.overruns = 0
         self.frames_sent = 0
+        self.failed_rehearsals = 0
         self.internal_errors: list[str] = []
         self._failed_cycles = 0
         self._sender = Sender(codec)
@@ -134,10 +134,12 @@ class ControllerNode:
         """
         if self._inputs is None or self._outputs is None:
             return
-        with contextlib.suppress(Exception):
+        try:
             self.mailbox.rehearse(self._frames)
             controller.step(self._tables, self._state, self._inputs)
             self._sender.rehearse(self._messages(self._inputs, self._outputs))
+        except Exception:
+            self.failed_rehearsals += 1
 
     def _messages(self, inputs: Inputs, outputs: Outputs) -> list[tuple[str, tuple[Any, ...]]]:
         """Return what every cycle sends: names and values."""

@@ -49,6 +49,12 @@ def test_each_stopping_condition_alone_ends_active_with_its_reason_and_reaction(
     assert (after.mode, after.reason, after.reaction) == (s.MODE_FAULT, row[4], row[5])
 
 
+def test_harder_reactions_stand_before_softer_ones():
+    reactions = [row[5] for row in supervisor.TRANSITIONS if row[0] == s.MODE_ACTIVE and row[3] == s.MODE_FAULT]
+    hardness = [supervisor.STOP_RELEASE, supervisor.STOP_EMERGENCY, supervisor.STOP_CONTROLLED]
+    assert reactions == sorted(reactions, key=hardness.index)
+
+
 def test_active_stays_while_nothing_is_wrong():
     fine = mask(c.VEHICLE_ACTIVE, c.VEHICLE_NOT_READY, c.NOT_AT_STANDSTILL, c.POSE_NOT_AT_START)
     assert supervisor.decide(state_in(s.MODE_ACTIVE), fine, PERIOD_US).mode == s.MODE_ACTIVE

@@ -159,6 +159,16 @@ def test_a_physical_bus_requires_real_time_unless_told_otherwise(
     assert seen == [(policy, 0)]
 
 
+@pytest.mark.parametrize("law", ["paper", "dob", "pid"])
+def test_no_car_is_driven_by_the_papers_laws(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], law: str
+) -> None:
+    monkeypatch.setattr(Bus, "is_physical", property(lambda _self: True))
+    assert main(["-i", "virtual", "-c", "law", "--no-config", "--law", law]) == 2
+    error = capsys.readouterr().err
+    assert error == f"parkctl: error: --law {law}: no car can be reversed by it; drive a car with --law car\n"
+
+
 # ------------------------------------------------------------------------------------------------------ set-up in order
 
 SET_UP = "import json; from firmware_py.realtime import set_up; o = set_up({policy!r}, {cpu}); print(json.dumps(o))"

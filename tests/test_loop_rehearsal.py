@@ -114,6 +114,7 @@ def test_nothing_differs_for_rehearsals(recording: Recording) -> None:
     plain, node = frames_of(recording, rehearsing=False)
     rehearsed, other = frames_of(recording, rehearsing=True)
     assert rehearsed == plain
+    assert other.failed_rehearsals == 0
     assert (other.mailbox.received, other.frames_sent, other.cycles) == (node.mailbox.received, len(plain), node.cycles)
     assert node.seen() == other.seen()
 
@@ -127,5 +128,6 @@ def test_a_rehearsal_that_fails_raises_nothing(recording: Recording, monkeypatch
 
     monkeypatch.setattr("firmware_py.core.controller.step", fail)
     node.rehearse()
+    assert node.failed_rehearsals == 1
     assert node.seen() == before
     assert not node.internal_errors

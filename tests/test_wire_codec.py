@@ -161,6 +161,20 @@ def test_the_two_frames_of_a_pose_are_handed_out_together_whichever_cycles_they_
         assert inputs.attitude.yaw_rad == pytest.approx(0.01 * (cycle - 1), abs=1e-5)
 
 
+def test_a_frame_that_lost_its_partner_is_not_paired_with_the_next_one_of_the_same_counter() -> None:
+    side, mailbox = CanSide(DBC, nodes=("LOC",)), Mailbox(CODEC)
+    first, second = PAIR
+    for cycle in range(40):
+        if cycle <= 3:
+            mailbox.put(cycle * 10_000_000, *side.encode(first, zeros(first) | {"position_x_m": 0.01 * cycle}))
+        attitude = side.encode(second, zeros(second))
+        if cycle != 3:  # lost; its position waits, and 15 cycles later the counter is the same
+            mailbox.put(cycle * 10_000_000, *attitude)
+        inputs = mailbox.take(cycle * 10_000, 0)
+        assert (inputs.used.used_position_counter != NO_COUNTER) == (cycle < 3), cycle
+        assert inputs.position.position_x_m <= 0.02
+
+
 @pytest.mark.parametrize("name", [n for n in STRUCTS if n.startswith("CTRL")])
 def test_controller_to_plant_frame_by_frame(name: str) -> None:
     side = CanSide(DBC, check_only=())

@@ -161,8 +161,8 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     wanted_rad = (wanted_rad - estimated.steering_offset_rad) / estimated.steering_gain
     paper = state.paper
     if tables.law == LAW_PAPER:
-        pose_is_new = health_state.pose_is_new
-        paper, wanted_rad = _paper_steering(tables, state, inputs, estimated, pose_is_new, direction, travel_mps)
+        believed = health_state.pose_is_new != 0 and estimated.disbelieved == 0
+        paper, wanted_rad = _paper_steering(tables, state, inputs, estimated, believed, direction, travel_mps)
     if not active and not stopping_on_path:
         wanted_rad = inputs.steer.road_wheel_angle_meas_rad
     limited = limits.limit_angle(car, wanted_rad, state.sent_angles_rad[0], PERIOD_S)
@@ -318,15 +318,15 @@ def _paper_steering(
     state: State,
     inputs: Inputs,
     estimated: estimator.EstimatorState,
-    pose_is_new: int,
+    pose_is_believed: bool,
     direction: int,
     travel_mps: float,
 ) -> tuple[paper_law.PaperState, float]:
-    """Return the paper's law's next state and angle: by the pose as it came, by the estimate where none did."""
+    """Return the paper's law's next state and angle: by the pose as it came, by the estimate where none is believed."""
     x_m = estimated.x_m
     y_m = estimated.y_m
     yaw_rad = estimated.yaw_rad
-    if pose_is_new != 0:
+    if pose_is_believed:
         x_m = inputs.position.position_x_m
         y_m = inputs.position.position_y_m
         yaw_rad = inputs.attitude.yaw_rad

@@ -18,7 +18,7 @@ L_EE, L_EP, L_PE, L_PP, L_BE, L_BP, L_DR = range(5, 12)  # with the yaw rate
 M_EE, M_EP, M_PE, M_PP, M_DE, M_DP = range(12, 18)  # without it
 GAIN_COLUMNS = 18
 
-# The laws: feedback on the poses as they come; with estimator and predictor; the paper's own (`paper_law`).
+# The laws: PID on the poses as they come; on what estimator and predictor make of them; the paper's own (`paper_law`).
 LAW_PLAIN, LAW_CAR, LAW_PAPER = range(3)
 
 
