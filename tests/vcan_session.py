@@ -31,7 +31,9 @@ FORWARD, REVERSE = 1, 3
 FORGED_EACH = 5
 ERROR_FRAMES = 4
 FLOOD_S = 5.0
-LEAD_IN_S = 1.0
+LEAD_IN_S = 0.4
+LEAD_IN_FRAMES = 40
+"""As many of a sensor's frames as there are cycles in the lead-in: each comes once more, and their mean stays."""
 FED_EARLIER_S = 0.002
 """Frames are fed so much earlier in the controller's cycle than they were recorded: canplayer is up to 1 ms late."""
 CYCLE_S = 0.01
@@ -76,6 +78,17 @@ def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM, limit_s:
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
+
+
+def end_recorder(process: subprocess.Popen[bytes], limit_s: float = 20.0) -> None:
+    """End candump once it sleeps: ended while it is waiting for the CPU, it would leave in its socket what is there."""
+    limit = time.monotonic() + limit_s
+    asleep = 0
+    while asleep < 4 and time.monotonic() < limit and process.poll() is None:
+        time.sleep(0.05)
+        state = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0]
+        asleep = asleep + 1 if state == "S" else 0
+    end(process)
 
 
 def run(*command: str) -> None:
@@ -125,7 +138,7 @@ def manoeuvre() -> None:
     figures["demo"] = {"status": demo.returncode, "error": demo.stderr, "duration_s": time.monotonic() - began_s}
     (FOLDER / "demo.txt").write_text(demo.stdout)
     time.sleep(0.2)
-    end(recorder)
+    end_recorder(recorder)
 
 
 def until_driven(step: Callable[[], bool]) -> None:
@@ -188,7 +201,7 @@ def disturbed() -> bool:
         "operator_status": wait_or_kill(operator),
         "emulator_status": end(car, signal.SIGINT),
     }
-    end(recorder)
+    end_recorder(recorder)
     return moving
 
 
@@ -269,7 +282,7 @@ def lead_in(lines: list[str]) -> list[str]:
         time_s, _, frame = line.split()
         name, _, data = frame.partition("#")
         kept = first.setdefault(name, [])
-        if name in FED_IDS and len(kept) < 40:
+        if name in FED_IDS and len(kept) < LEAD_IN_FRAMES:
             kept.append((float(time_s[1:-1]), bytes.fromhex(data)))
     fed = {name: kept for name, kept in first.items() if kept}
     end_s = max(kept[0][0] for kept in fed.values())
@@ -339,7 +352,7 @@ def replay() -> None:
         status = play(fed)
         driven = any(report.get("mode") == ACTIVE for report in controller.reports())
         end(controller.process, signal.SIGKILL)  # it would wait for a car to stand that is not there
-        end(recorder)
+        end_recorder(recorder)
         figures["replay"] = {"ready": ready, "player_status": status, "attempts": attempt}
         if driven:
             break
