@@ -34,8 +34,9 @@ FLOOD_S = 5.0
 LEAD_IN_S = 0.4
 LEAD_IN_FRAMES = 40
 """As many of a sensor's frames as there are cycles in the lead-in: each comes once more, and their mean stays."""
-FED_EARLIER_S = 0.002
-"""Frames are fed so much earlier in the controller's cycle than they were recorded: canplayer is up to 1 ms late."""
+FED_EARLIER_S = 0.005
+"""So much earlier in the controller's cycle frames are fed than they were recorded: canplayer is 2 to 3 ms late in the
+guest, and they come in the middle then, with room on both sides."""
 CYCLE_S = 0.01
 SET_PIPE_SIZE = 1031
 """fcntl.F_SETPIPE_SZ, for an interpreter without it."""
