@@ -12,6 +12,7 @@ from typing import NamedTuple
 from firmware_py.core import conditions as c
 from firmware_py.core import estimator, health, limits, manoeuvre, paper_law, pid, predictor, speed, supervisor
 from firmware_py.core import gate as last_gate
+from firmware_py.core.bounds import bounded
 from firmware_py.core.motion import QUEUE_LENGTH
 from firmware_py.core.path import feedforward_at, plan_at
 from firmware_py.core.schedule import gains_at
@@ -212,7 +213,7 @@ def _elapsed_s(last_us: int, now_us: int) -> float:
     """Return the time since the last cycle; one period where there was none."""
     if last_us < 0:
         return PERIOD_S
-    return max(min((now_us - last_us) * 1e-6, LONGEST_CYCLE_S), 0.0)
+    return bounded((now_us - last_us) * 1e-6, 0.0, LONGEST_CYCLE_S)
 
 
 def _believed(tables: Tables, state: State) -> health.Believed:

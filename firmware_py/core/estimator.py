@@ -19,6 +19,7 @@ speed), one set with the yaw rate and one without.
 import math
 from typing import NamedTuple
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.path import pose_at, wrap_angle
 from firmware_py.core.schedule import Gains
 from firmware_py.core.tables import CarTable, LegTable
@@ -188,7 +189,7 @@ def estimate(
     change_rad = 0.0
     if follows != 0:
         limit_rad = car.max_road_wheel_rate_radps * dt_s
-        change_rad = max(min(car.lag_alpha * (acted_rad - modelled_rad), limit_rad), -limit_rad)
+        change_rad = bounded(car.lag_alpha * (acted_rad - modelled_rad), -limit_rad, limit_rad)
         modelled_rad += change_rad
     elif angle_is_fresh != 0:
         modelled_rad = meas_rad
@@ -198,11 +199,11 @@ def estimate(
         angle_rad = meas_rad
         if follows != 0:
             offset_rad += gains.offset * gap_rad
-            offset_rad = max(min(offset_rad, STEERING_OFFSET_MAX_RAD), -STEERING_OFFSET_MAX_RAD)
+            offset_rad = bounded(offset_rad, -STEERING_OFFSET_MAX_RAD, STEERING_OFFSET_MAX_RAD)
             turning = change_rad / (STEERING_GAIN_RATE_RADPS * max(dt_s, LEAST_DT_S))
             weight = modelled_rad * modelled_rad + STEERING_GAIN_ANGLE_RAD * STEERING_GAIN_ANGLE_RAD
             gain += STEERING_GAIN_1PM * abs(ds_m) * modelled_rad * gap_rad / (weight * (1.0 + turning * turning))
-            gain = max(min(gain, 1.0 + STEERING_GAIN_SPREAD), 1.0 - STEERING_GAIN_SPREAD)
+            gain = bounded(gain, 1.0 - STEERING_GAIN_SPREAD, 1.0 + STEERING_GAIN_SPREAD)
 
     # The path at the station that odometry has come to.
     station_m += ds_m
@@ -282,8 +283,10 @@ def estimate(
             else:
                 road_rad += car.wheelbase_m * learnt
             scale += SCALE_GAIN_1PM2 * abs(ds_m) * sigma * new_along_m
-            scale = max(min(scale, 1.0 + ODOMETRY_SCALE_MAX), 1.0 - ODOMETRY_SCALE_MAX)
-            averaged = min(averaged + 1, MOVING_PRIOR)
+            scale = bounded(scale, 1.0 - ODOMETRY_SCALE_MAX, 1.0 + ODOMETRY_SCALE_MAX)
+            averaged += 1
+            if averaged > MOVING_PRIOR:
+                averaged = MOVING_PRIOR
             disbelieved = 0
         else:
             disbelieved += 1
@@ -294,9 +297,10 @@ def estimate(
         cross_m += left_m
         heading_rad += turned_rad
     if standstill == 0:
-        bias_averaged = min(bias_averaged, MOVING_PRIOR)
-        road_rad = max(min(road_rad, ROAD_DISTURBANCE_MAX_RAD), -ROAD_DISTURBANCE_MAX_RAD)
-        bias_radps = max(min(bias_radps, GYRO_BIAS_MAX_RADPS), -GYRO_BIAS_MAX_RADPS)
+        if bias_averaged > MOVING_PRIOR:
+            bias_averaged = MOVING_PRIOR
+        road_rad = bounded(road_rad, -ROAD_DISTURBANCE_MAX_RAD, ROAD_DISTURBANCE_MAX_RAD)
+        bias_radps = bounded(bias_radps, -GYRO_BIAS_MAX_RADPS, GYRO_BIAS_MAX_RADPS)
 
     return EstimatorState(
         x_m,

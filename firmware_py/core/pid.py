@@ -5,6 +5,7 @@ Every state advances with distance, so nothing divides by speed and everything f
 
 import math
 
+from firmware_py.core.bounds import bounded
 from firmware_py.core.schedule import Gains
 from firmware_py.core.tables import CarTable
 
@@ -24,7 +25,7 @@ def preview_error_m(cross_track_error_m: float, heading_error_rad: float, previe
 
     Of the cross-track error itself no more than CROSS_TRACK_MAX_M counts.
     """
-    cross_m = max(min(cross_track_error_m, CROSS_TRACK_MAX_M), -CROSS_TRACK_MAX_M)
+    cross_m = bounded(cross_track_error_m, -CROSS_TRACK_MAX_M, CROSS_TRACK_MAX_M)
     return cross_m + sigma * preview_m * math.sin(heading_error_rad)
 
 
@@ -44,7 +45,7 @@ def integrate_m2(integral_m2: float, preview_m: float, ds_m: float, gains: Gains
     if limited != 0 or gains.ki <= 0.0:
         return integral_m2
     bound_m2 = INTEGRAL_AUTHORITY_1PM / gains.ki
-    return max(min(integral_m2 + preview_m * ds_m, bound_m2), -bound_m2)
+    return bounded(integral_m2 + preview_m * ds_m, -bound_m2, bound_m2)
 
 
 def push_rad(lacking_rad: float, car: CarTable) -> float:
