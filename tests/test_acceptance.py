@@ -16,6 +16,7 @@ from sim.data_files import SIDES, load_course, load_scenario, load_vehicle
 from sim.examiner import TOUCHED
 from sim.plant import TruthRow
 from tools.campaign import manoeuvre
+from tools.campaign.draws import draw
 from tools.campaign.single import Runner, share
 from tools.design.tables import design_tables
 from tools.figures import load_path, project
@@ -99,6 +100,17 @@ def test_clearance_is_kept(runner_of):
         outcome.notes.value[examiner.MIN_CLEARANCE_M] for _, outcome in runs_of(runner_of("car"), "car", SEEDS)
     )
     assert least_m >= 0.30
+
+
+def test_cars_that_leave_the_sharpest_bend_at_full_lock_keep_their_room(runner_of):
+    """Steering gain near 0.9, long wheelbase: 0.5 rad is not enough for the path, and the wheels then swing over."""
+    vehicle, scenario = load_vehicle("paper"), load_scenario("car")
+    for seed in (1004203, 1004453, 1004465, 1006390, 1006920, 1007528, 1007604, 1009169):
+        drawn = draw(vehicle, scenario, seed)
+        assert drawn.scenario.plant.unknown["wheelbase_m"][0] > 4.1
+        outcome = runner_of("car").run(drawn.scenario, drawn.side, seed)
+        assert outcome.end[manoeuvre.COMPLETED], seed
+        assert outcome.notes.value[examiner.MIN_CLEARANCE_M] >= 0.25, seed
 
 
 @pytest.mark.parametrize("side", SIDES)

@@ -168,7 +168,8 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         wanted_rad = inputs.steer.road_wheel_angle_meas_rad
     limited = limits.limit_angle(car, wanted_rad, state.sent_angles_rad[0], PERIOD_S)
     preview_m = pid.preview_error_m(cross_m, heading_rad, gains.preview_m, leg.sigma)
-    integral_m2 = pid.integrate_m2(integral_m2, preview_m, travel_mps * dt_s, gains, limited.limited)
+    held = 1 if limited.limited != 0 or abs(cross_m) > pid.CROSS_TRACK_MAX_M else 0
+    integral_m2 = pid.integrate_m2(integral_m2, preview_m, travel_mps * dt_s, gains, held)
 
     # Speed, then the last word.
     station_now_m = estimated.station_m + travel_mps * REPORT_AGE_S

@@ -15,7 +15,7 @@ INTEGRAL_AUTHORITY_1PM = 0.02
 ANGLE_GAIN = 0.55
 """Share of what the wheels will lack of their wanted angle that is commanded on top of it."""
 
-CROSS_TRACK_MAX_M = 0.02
+CROSS_TRACK_MAX_M = 0.025
 """A car that is farther off comes back at the angle that this asks for: about 1.5 degrees. Between the cones of the box
 a steeper way back would swing the body's ends out."""
 
