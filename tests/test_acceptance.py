@@ -1,7 +1,9 @@
 """What the law `car` must hold with the paper's car on the shipped path, over 200 runs of each scenario.
 
 The runs are lock-step's, compiled (`tests/test_campaign_bits.py` holds both against each other, tick by tick). Errors
-are true ones of the rear axle against the plant's own pose; none of these seeds was used in the design.
+are true ones of the rear axle against the plant's own pose. The numbers of estimator and PID were chosen on other seeds
+and on a campaign; how a start off the path is corrected was looked at on the first 30 of these, and the bounds on p95
+and rms of `car-drift` were set after runs of these.
 """
 
 from functools import cache
