@@ -172,12 +172,13 @@ def test_interface_down_and_up_is_survived_as_a_fault_and_reported(session: Sess
     )
     assert (disturbed["operator_status"], disturbed["emulator_status"]) == (1, 0)
     assert re.search(r"stopped: .*Timeout", (folder / "disturbed/operate.txt").read_text())
-    # Back on the bus, the controller says Fault; the plant's own watchdog has stopped the car.
+    # Back on the bus, the controller says Fault; the plant's own watchdog has stopped the car. Nothing is on a bus that
+    # is down, so all that comes after "down" is of "up" again; when the command for it returned says nothing.
     command = DATABASE.get_message_by_name("CTRL_SysCmd")
     after = [
         command.decode(data)
         for time_s, number, data, _ in load_log(folder / "disturbed.log")
-        if number == command.frame_id and time_s > session.figures["up_unix_s"]
+        if number == command.frame_id and time_s > session.figures["down_unix_s"]
     ]
     assert len(after) > 10
     assert {str(values["control_mode"]) for values in after} == {"Fault"}

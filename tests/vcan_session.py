@@ -190,7 +190,6 @@ def disturbed() -> bool:
     figures["down_unix_s"] = time.time()
     noticed = controller.wait_for(lambda report: report.get("mode") == FAULT, 8.0)
     run("ip", "link", "set", "vcan0", "up")
-    figures["up_unix_s"] = time.time()
     status = wait_or_kill(controller.process, 30.0)
     figures["disturbed"] = {
         "driving": driving,
