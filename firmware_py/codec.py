@@ -38,6 +38,7 @@ STRUCTS: dict[str, type[Any]] = {
     "CTRL_Version": signals.ControllerVersion,
     "CTRL_HealthTiming": signals.HealthTiming,
     "CTRL_HealthCounts": signals.HealthCounts,
+    "CTRL_Estimate": signals.Estimate,
     "VEH_SysRpt": signals.SysReport,
     "VEH_SteerRpt": signals.SteerReport,
     "VEH_MotionRpt": signals.MotionReport,

@@ -20,6 +20,7 @@ from firmware_py.core.signals import (
 )
 from firmware_py.core.supervisor import STOP_EMERGENCY, STOP_RELEASE, SupervisorState
 from firmware_py.core.tables import Tables, Timeouts
+from firmware_py.estimate_frames import EstimateFrames
 from firmware_py.health_frames import HealthFrames
 from firmware_py.record import FlightRecord
 from firmware_py.table_file import TableSet
@@ -79,6 +80,7 @@ class ControllerNode:
         self.mailbox = Mailbox(codec)
         self.record = FlightRecord()
         self.health = HealthFrames()
+        self.estimate = EstimateFrames(tables)
         self.stop_requested = False
         self.cycles = 0
         self.overruns = 0
@@ -95,7 +97,7 @@ class ControllerNode:
         self._cycle_index = 0
         self._every = {
             name: codec.messages[name].cycle_time_ms * 1000 // controller.PERIOD_US
-            for name in ("CTRL_Version", "CTRL_HealthTiming", "CTRL_HealthCounts")
+            for name in ("CTRL_Version", "CTRL_HealthTiming", "CTRL_HealthCounts", "CTRL_Estimate")
         }
         self._version = ControllerVersion(PROTOCOL, tables.dbc_hash24, tables.vehicle_hash24)
 
@@ -115,6 +117,7 @@ class ControllerNode:
         self.overruns += overruns
         self._cycle_index = (self._cycle_index + 1 + overruns) % CYCLE_INDEX_VALUES
         self.record.append(inputs, outputs)
+        self.estimate.add(self._state, inputs)
 
         pack = self._sender.pack
         out = [pack(name, values) for name, values in self._messages(inputs, outputs)]
@@ -124,6 +127,8 @@ class ControllerNode:
             out.append(pack("CTRL_HealthTiming", self.health.timing()))
         if self.cycles % self._every["CTRL_HealthCounts"] == 0:
             out.append(pack("CTRL_HealthCounts", self.health.counts(self.mailbox, self.overruns, send_failed)))
+        if self.cycles % self._every["CTRL_Estimate"] == 0:
+            out.append(pack("CTRL_Estimate", self.estimate.take(self._state)))
         self.frames_sent += len(out)
         return out
 

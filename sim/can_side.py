@@ -20,7 +20,7 @@ from sim.errors import UserError
 Values = dict[str, int | float]
 
 PLANT_NODES = ("VEH", "LOC")
-LOG_ONLY = ("CTRL_Cycle", "CTRL_CycleInputs", "CTRL_Track", "CTRL_HealthTiming", "CTRL_HealthCounts")
+LOG_ONLY = ("CTRL_Cycle", "CTRL_CycleInputs", "CTRL_Track", "CTRL_HealthTiming", "CTRL_HealthCounts", "CTRL_Estimate")
 """Messages that say nothing to a vehicle: checked, counted, not decoded."""
 
 NS_PER_MS = 1_000_000

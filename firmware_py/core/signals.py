@@ -200,6 +200,16 @@ class HealthCounts(NamedTuple):
     send_failed_count: int
 
 
+class Estimate(NamedTuple):
+    """CTRL_Estimate: how sure the controller is of its place (m, rad), and what it has learnt of the car."""
+
+    cross_track_sigma_m: float
+    heading_sigma_rad: float
+    steering_gain_est: float
+    steering_offset_est_rad: float
+    odometry_scale_est: float
+
+
 class Inputs(NamedTuple):
     """All that one cycle knows of the world: the newest valid values, and which of them are new.
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.core.covariance import HEADING_WALK, YAW_RATE_NOISE_RADPS
 from firmware_py.core.estimator import ODOMETRY_LENGTH
 from firmware_py.core.motion import QUEUE_LENGTH
 from sim.data_files import Criteria, Vehicle
@@ -40,14 +41,11 @@ POSITION_NOISE_M = 0.01
 HEADING_NOISE_RAD = math.radians(0.1)
 """Noise of one pose, of the localisation that the design assumes."""
 
-YAW_RATE_NOISE_RADPS = math.radians(0.02)
 YAW_RATE_WALK = math.radians(0.002)
-"""Noise of a yaw rate (rad/s a sample) and walk of the gyro's bias (rad/s per root second)."""
+"""Walk of the gyro's bias, rad/s per root second."""
 
 SIDE_SLIP = 0.25e-3
-HEADING_WALK = 0.2e-3
-"""With the yaw rate: what the rear tyres' unknown slip moves the car aside (m), and what is left of heading that the
-yaw rate does not show (rad), per root metre of travel."""
+"""With the yaw rate: what the rear tyres' unknown slip moves the car aside, m per root metre of travel."""
 
 ROAD_WALK_1PM = 0.5e-3
 """Change of the road disturbance per root metre: the play of the steering goes from one side to the other."""
