@@ -298,14 +298,21 @@ def _legs(
     return legs[0], legs[1]
 
 
-def _load_gains(file: Path) -> GainTable:
-    rows = _read_csv(file, GAINS_COLUMNS)
+def _by_direction(file: Path, rows: list[tuple[float, ...]]) -> tuple[tuple[float, ...], list[list[tuple[float, ...]]]]:
+    """Return the grid of speeds of a schedule, and its rows forward and in reverse."""
     by_direction = [[row for row in rows if row[0] == direction] for direction in (1.0, -1.0)]
     grid = tuple(row[1] for row in by_direction[0])
-    if len(grid) < 2 or grid[0] != 0.0 or any(b <= a for a, b in pairwise(grid)):
-        raise UserError(f"{file}: speed_mps must increase from 0 in direction +1; {REMEDY}")
+    if len(grid) < 2 or grid[0] < 0.0 or any(b <= a for a, b in pairwise(grid)):
+        raise UserError(f"{file}: speed_mps must increase, none below 0, in direction +1; {REMEDY}")
     if tuple(row[1] for row in by_direction[1]) != grid or len(rows) != 2 * len(grid):
         raise UserError(f"{file}: directions +1 and -1 must have the same speeds and no other rows; {REMEDY}")
+    return grid, by_direction
+
+
+def _load_gains(file: Path) -> GainTable:
+    grid, by_direction = _by_direction(file, _read_csv(file, GAINS_COLUMNS))
+    if grid[0] != 0.0:
+        raise UserError(f"{file}: speed_mps must begin at 0; {REMEDY}")
     gain = tuple(tuple(row[2 : 2 + GAIN_COLUMNS] for row in rows_of) for rows_of in by_direction)
     return GainTable(speed_grid_mps=grid, last_row=len(grid) - 1, gain=gain)
 
@@ -313,12 +320,7 @@ def _load_gains(file: Path) -> GainTable:
 def _load_paper(file: Path) -> PaperTable:
     """Return the table of one of the paper's laws; a part whose columns are all zero is not in it."""
     rows = _read_csv(file, PAPER_COLUMNS)
-    by_direction = [[row for row in rows if row[0] == direction] for direction in (1.0, -1.0)]
-    grid = tuple(row[1] for row in by_direction[0])
-    if len(grid) < 2 or grid[0] < 0.0 or any(b <= a for a, b in pairwise(grid)):
-        raise UserError(f"{file}: speed_mps must increase, none below 0, in direction +1; {REMEDY}")
-    if tuple(row[1] for row in by_direction[1]) != grid or len(rows) != 2 * len(grid):
-        raise UserError(f"{file}: directions +1 and -1 must have the same speeds and no other rows; {REMEDY}")
+    grid, by_direction = _by_direction(file, rows)
     for number, row in enumerate(rows, 1):
         for name, value in zip(PAPER_COLUMNS[2:7], row[2:7], strict=True):
             if value < 0.0:

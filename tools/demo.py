@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from firmware_py.table_file import LAWS
 from sim.errors import UserError
 from tools.buses import BusChoice, add_bus_arguments, choose_own_bus, open_bus, opened, refuse_occupied_bus
 from tools.run_folder import MARK, RunFolder, check_writable_file, write_whole
@@ -32,7 +33,6 @@ LISTEN_S = 0.25
 """A bus is listened to for so long before it is used: twice the longest timeout of a fast message."""
 DBC = Path(__file__).resolve().parent.parent / "dbc" / "parking.dbc"
 DEFAULT_COURSE = "ohio"
-LAWS = ("car", "pid+ff", "paper", "dob", "pid")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -45,13 +45,6 @@ STANDSTILL = 43
 MANOEUVRE_DONE = 44
 
 
-def bit(reason: int, present: bool) -> int:
-    """Return the condition's bit if it is present, else 0."""
-    if present:
-        return 1 << reason
-    return 0
-
-
 def has(conditions: int, reason: int) -> bool:
     """Return whether a condition is present."""
     return (conditions & (1 << reason)) != 0

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from firmware_py.table_file import PAPER_COLUMNS
 from sim.body import clearance_array_m, outline_of
 from sim.data_files import Course, Vehicle, load_course, load_scenario, load_vehicle
 from tools.design.path import GRID_M, Path
@@ -29,10 +30,6 @@ if TYPE_CHECKING:
     from tools.design.tables import DesignReport
 
 SCENARIO = "paper"
-COLUMNS = (
-    "direction", "speed_mps", "preview_m", "kp", "ki", "kd", "inverse_gain", "inverse_pole", "q_b1", "q_b2", "q_a1",
-    "q_a2",
-)  # fmt: skip
 WHAT = (
     "the paper's law on e_y of the centre of gravity: PID (rad, m, s), 1/Gn and Q (z, 10 ms) by direction and speed; "
     "a part of zeros is not in the law"
@@ -40,7 +37,7 @@ WHAT = (
 
 
 def law_rows(vehicle: Vehicle, stored: StoredFit) -> dict[str, list[tuple[float, ...]]]:
-    """Rows in the order of COLUMNS of each of the paper's laws, by the firmware's name, for a car."""
+    """Rows in the order of PAPER_COLUMNS of each of the paper's laws, by the firmware's name, for a car."""
     car = car_of(vehicle)
     gains = gains_for(car, stored)
     rows = {}
@@ -64,7 +61,9 @@ def law_texts(vehicle: Vehicle, stored: StoredFit | None = None) -> dict[str, st
     from tools.design.tables import csv_text  # noqa: PLC0415 -- it writes these among its own
 
     stored = stored or load_fit()
-    return {f"gains_{name}.csv": csv_text(WHAT, COLUMNS, rows) for name, rows in law_rows(vehicle, stored).items()}
+    return {
+        f"gains_{name}.csv": csv_text(WHAT, PAPER_COLUMNS, rows) for name, rows in law_rows(vehicle, stored).items()
+    }
 
 
 def study_pair() -> tuple[Vehicle, Course]:
