@@ -10,13 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import can
+import numpy as np
 import pytest
 from PIL import Image
 
 from sim.body import clearance_m, outline_of
 from sim.data_files import FOLDERS, load_course, load_vehicle
+from sim.errors import UserError
 from tools import cli, lockstep
-from tools.figures import load_truth
+from tools.estimates import load_estimates
+from tools.figures import FORWARD, REVERSE, load_path, load_truth, split_legs
 
 
 @pytest.fixture(autouse=True)
@@ -141,3 +144,32 @@ def test_an_interrupt_leaves_no_folder(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert cli.main(["demo", "--lockstep"]) == 130
     assert capsys.readouterr().err == "parkctl: interrupted\n"
     assert not list(Path().rglob("run.json"))
+
+
+def test_what_the_controller_believed_is_read_from_the_bus_log() -> None:
+    """On the picture the estimate lies where the car truly is on its path, in both legs, and nearly always within."""
+    demo("--seed", "3", "--no-plots")
+    truth, path = load_truth(Path("run") / "truth.csv"), load_path(_shipped("paper"), "left")
+    estimates = load_estimates(Path("run") / "bus.log", lockstep.DBC, path.length_m)
+    assert set(estimates) == {FORWARD, REVERSE}
+    for leg in split_legs(truth, path, None):
+        believed, station_m = estimates[leg.direction], leg.on_path.station_m
+        order = np.argsort(station_m)
+        true_m = np.interp(believed.station_m, station_m[order], leg.on_path.cross_track_error_m[order])
+        within = np.abs(believed.cross_track_error_m - true_m) <= 2.0 * believed.cross_track_sigma_m
+        assert len(within) > 140
+        assert np.mean(within) > 0.85
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("(1.0) vcan0 204#00\n(1.1) vcan0 nothing\n", ":2: must be (TIME) CHANNEL ID#DATA, as candump -L writes"),
+        ("(1.0) vcan0 204#00\u00e4\n", ": cannot be read: not a bus log"),
+    ],
+)
+def test_a_bus_log_that_is_none_is_one_line(content: str, message: str) -> None:
+    Path("bus.log").write_text(content)
+    with pytest.raises(UserError) as error:
+        load_estimates(Path("bus.log"), lockstep.DBC, 12.0)
+    assert str(error.value) == f"bus.log{message}"

@@ -348,6 +348,7 @@ def _report(
 
 
 def _plot(plan: Plan, folder: RunFolder, truth: Truth, path: PathTable, legs: list[Leg], why: str | None) -> None:
+    from tools.estimates import load_estimates  # noqa: PLC0415
     from tools.plots import signals, swept_body  # noqa: PLC0415
 
     title = (
@@ -364,4 +365,5 @@ def _plot(plan: Plan, folder: RunFolder, truth: Truth, path: PathTable, legs: li
     }
     swept_body(folder.path / "swept_body.png", side=plan.side, **common)  # type: ignore[arg-type]
     if legs:
-        signals(folder.path / "signals.png", **common)  # type: ignore[arg-type]
+        estimates = load_estimates(folder.path / "bus.log", DBC, path.length_m)
+        signals(folder.path / "signals.png", estimates=estimates, **common)  # type: ignore[arg-type]

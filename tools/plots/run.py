@@ -14,6 +14,7 @@ from matplotlib.patches import Circle, Polygon
 
 from sim.body import Outline, clearance_array_m, outline_of, polygon
 from sim.data_files import Course, Side, Vehicle
+from tools.estimates import Estimates
 from tools.figures import FORWARD, Leg, PathTable, Truth, command_rate, leg_figures
 
 COLOUR = {FORWARD: "tab:blue", "reverse": "tab:red"}
@@ -115,9 +116,20 @@ def _nearest_point(corners: np.ndarray[Any, Any], point: np.ndarray[Any, Any]) -
 
 
 def signals(
-    file: Path, *, vehicle: Vehicle, course: Course, truth: Truth, path: PathTable, legs: Sequence[Leg], title: str
+    file: Path,
+    *,
+    vehicle: Vehicle,
+    course: Course,
+    truth: Truth,
+    path: PathTable,
+    legs: Sequence[Leg],
+    title: str,
+    estimates: Mapping[str, Estimates] | None = None,
 ) -> None:
-    """Draw speed, steering with its limits, errors and clearance of both legs over the path's station."""
+    """Draw speed, steering with its limits, errors and clearance of both legs over the path's station.
+
+    Where `estimates` of a leg are given, what the controller believed of its error lies behind the true one.
+    """
     figure, rows = plt.subplots(6, 1, figsize=(12, 17), sharex=True, layout="constrained")
     speed, angle, rate, error, heading, clearance = rows
     for leg in legs[:MAX_LEGS]:
@@ -147,6 +159,13 @@ def signals(
             label=f"{name}, rear axle: max {1e3 * figures['max_cross_track_m']:.2f} mm, "
             f"rms {1e3 * figures['rms_cross_track_m']:.2f} mm",
         )  # fmt: skip
+        believed = (estimates or {}).get(name)
+        if believed is not None:
+            middle, width = 1e3 * believed.cross_track_error_m, 2e3 * believed.cross_track_sigma_m
+            error.fill_between(
+                believed.station_m, middle - width, middle + width, color=colour, alpha=0.12, lw=0.0,
+                label=f"{name}, estimate ±2 sigma",
+            )  # fmt: skip
         heading.plot(station, np.degrees(leg.on_path.heading_error_rad), color=colour, label=name)
         clearance.plot(
             station,
@@ -170,7 +189,9 @@ def signals(
         axes.set_ylabel(label)
         axes.grid(visible=True, alpha=0.3)
         axes.margins(x=0.01)
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.985), ncols=6, fontsize=8, frameon=False)
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 0.985), ncols=3 if axes is error else 6, fontsize=8, frameon=False
+        )
     clearance.set_xlabel("station along the path (m): the forward leg runs to the right, reverse to the left")
     figure.suptitle(title)
     _save(figure, file)
