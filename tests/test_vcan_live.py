@@ -339,8 +339,8 @@ def test_the_guest_passes_status_output_and_results_and_protects_the_rest(tmp_pa
 def test_an_interrupt_reaches_the_command_and_nothing_is_left(tmp_path: Path) -> None:
     need_guest()
     script = (
-        "import time\nprint('up', flush=True)\n"
-        "try:\n  time.sleep(60)\nexcept KeyboardInterrupt:\n  print('bye')\n  raise SystemExit(9)"
+        "import time\n"
+        "try:\n  print('up', flush=True)\n  time.sleep(60)\nexcept KeyboardInterrupt:\n  print('bye')\n  raise SystemExit(9)"
     )
     process = subprocess.Popen(
         [*PARKCTL, "guest", "--results", str(tmp_path), "--", sys.executable, "-c", script],
