@@ -208,9 +208,7 @@ def assess(
     if moving_allowed and stopping == 0 and abs(speed_mps) < STUCK_MPS:
         stuck_us = _older_us(state.stuck_us, period_us)
     wrong_direction_us = 0
-    if active and (
-        speed_mps * sigma < -WRONG_DIRECTION_MPS or (driving == 0 and abs(speed_mps) > ROLLING_MPS)
-    ):
+    if active and (speed_mps * sigma < -WRONG_DIRECTION_MPS or (driving == 0 and abs(speed_mps) > ROLLING_MPS)):
         wrong_direction_us = _older_us(state.wrong_direction_us, period_us)
     rejected_us = 0
     if active and (sys.sys_cmd_timeout != 0 or steer.steer_cmd_timeout != 0 or long.long_cmd_timeout != 0):
