@@ -14,7 +14,7 @@ from firmware_py.core import estimator, health, limits, manoeuvre, paper_law, pi
 from firmware_py.core import gate as last_gate
 from firmware_py.core.bounds import bounded
 from firmware_py.core.motion import QUEUE_LENGTH
-from firmware_py.core.path import feedforward_at, plan_at
+from firmware_py.core.path import feedforward_at
 from firmware_py.core.schedule import gains_at
 from firmware_py.core.signals import (
     GEAR_NONE,
@@ -33,7 +33,7 @@ from firmware_py.core.signals import (
     SysCommand,
     Track,
 )
-from firmware_py.core.tables import LAW_CAR, LAW_PAPER, CarTable, LegTable, Tables
+from firmware_py.core.tables import LAW_CAR, LAW_PAPER, CarTable, Tables
 
 PERIOD_US = 10_000
 PERIOD_S = 0.01
@@ -112,8 +112,22 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
 
     # Facts, then the decision.
     last_direction = manoeuvre.direction_of(leg_state.leg)
+    kept_cross_m, kept_heading_rad = estimated.cross_track_error_m, estimated.heading_error_rad
+    if law == LAW_PAPER and leg_state.driving != 0:
+        # What this law keeps to its path is the centre of gravity.
+        kept_cross_m, kept_heading_rad = paper.cross_track_error_m, paper.heading_error_rad
     health_state, conditions = health.assess(
-        tables, health_state, inputs, _believed(state, tables.leg[last_direction], law), PERIOD_US
+        tables,
+        health_state,
+        inputs,
+        tables.leg[last_direction],
+        decided.mode,
+        leg_state.driving,
+        reference.stopping,
+        estimated,
+        kept_cross_m,
+        kept_heading_rad,
+        PERIOD_US,
     )
     if leg_state.gear_failed != 0:
         conditions |= 1 << c.DIRECTION_CHANGE_TIMEOUT
@@ -265,34 +279,6 @@ def _elapsed_s(last_us: int, now_us: int) -> float:
     if last_us < 0:
         return PERIOD_S
     return bounded((now_us - last_us) * 1e-6, 0.0, LONGEST_CYCLE_S)
-
-
-def _believed(state: State, leg: LegTable, law: int) -> health.Believed:
-    """Return what the last cycle left of the law's view, for comparison with this cycle's reports."""
-    path = state.estimator
-    station_m = path.station_m
-    planned_mps, _accel_mps2 = plan_at(leg, station_m)
-    cross_m = path.cross_track_error_m
-    heading_rad = path.heading_error_rad
-    driving = state.manoeuvre.driving
-    if law == LAW_PAPER and driving != 0:
-        # What this law keeps to its path is the centre of gravity.
-        cross_m = state.paper.cross_track_error_m
-        heading_rad = state.paper.heading_error_rad
-    return health.Believed(
-        state.supervisor.mode,
-        leg.sigma,
-        driving,
-        state.speed.stopping,
-        planned_mps,
-        station_m - leg.length_m,
-        cross_m,
-        heading_rad,
-        station_m,
-        path.disbelieved,
-        path.averaged,
-        path.modelled_angle_rad,
-    )
 
 
 def _steering(

@@ -7,6 +7,8 @@ controller that was late itself does not take its peers for silent; its own late
 from typing import NamedTuple
 
 from firmware_py.core import conditions as c
+from firmware_py.core.estimator import EstimatorState
+from firmware_py.core.path import plan_at
 from firmware_py.core.signals import (
     MODE_ACTIVE,
     MODE_FAULT,
@@ -15,7 +17,7 @@ from firmware_py.core.signals import (
     QUALITY_FIXED,
     Inputs,
 )
-from firmware_py.core.tables import Tables
+from firmware_py.core.tables import LegTable, Tables
 
 PROTOCOL = 1
 """Version of the rules of the bus (CONVENTIONS.md) that the controller follows."""
@@ -99,23 +101,6 @@ class HealthState(NamedTuple):
     pose_is_new: int
 
 
-class Believed(NamedTuple):
-    """What the law believes of itself, for comparison with the reports."""
-
-    mode: int
-    direction_sigma: float
-    driving: int
-    stopping: int
-    planned_mps: float
-    beyond_end_m: float
-    cross_track_error_m: float
-    heading_error_rad: float
-    station_m: float
-    disbelieved: int
-    averaged: int
-    model_angle_rad: float
-
-
 def begin() -> HealthState:
     """Return the state before the first cycle: nothing was ever received."""
     never = Ages(
@@ -151,27 +136,29 @@ def _older_us(age_us: int, passed_us: int) -> int:
 
 
 def assess(
-    tables: Tables, state: HealthState, inputs: Inputs, believed: Believed, period_us: int
+    tables: Tables,
+    state: HealthState,
+    inputs: Inputs,
+    leg: LegTable,
+    mode: int,
+    driving: int,
+    stopping: int,
+    path: EstimatorState,
+    cross_track_error_m: float,
+    heading_error_rad: float,
+    period_us: int,
 ) -> tuple[HealthState, int]:
-    """Return the next state and the conditions present in this cycle (bits of `conditions`)."""
+    """Return the next state and the conditions present in this cycle (bits of `conditions`).
+
+    `mode` to `heading_error_rad` are what the last cycle left: what the controller believes of itself and of the car's
+    place on the leg, for comparison with the reports.
+    """
     _now_us, used, sys, steer, motion, long, position, attitude, oper, version, second_controller = inputs
-    (
-        mode,
-        sigma,
-        driving,
-        stopping,
-        planned_mps,
-        beyond_end_m,
-        cross_m,
-        heading_rad,
-        station_m,
-        disbelieved,
-        averaged,
-        model_angle_rad,
-    ) = believed
     active = mode == MODE_ACTIVE
     moving_allowed = active and driving != 0
+    station_m = path.station_m
     speed_mps = motion.speed_meas_mps
+    travel_mps = leg.sigma * speed_mps
     vehicle_state = sys.vehicle_state
 
     # How old each report is: 0 with a new frame that does not say itself that it is invalid.
@@ -199,16 +186,18 @@ def assess(
 
     # What may not last.
     steering_gap_us = 0
-    if active and abs(steer.road_wheel_angle_meas_rad - model_angle_rad) > STEERING_GAP_RAD:
+    if active and abs(steer.road_wheel_angle_meas_rad - path.modelled_angle_rad) > STEERING_GAP_RAD:
         steering_gap_us = _older_us(state.steering_gap_us, period_us)
     speed_gap_us = 0
-    if moving_allowed and speed_mps * sigma > planned_mps + SPEED_GAP_MPS:
-        speed_gap_us = _older_us(state.speed_gap_us, period_us)
     stuck_us = 0
-    if moving_allowed and stopping == 0 and abs(speed_mps) < STUCK_MPS:
-        stuck_us = _older_us(state.stuck_us, period_us)
+    if moving_allowed:
+        planned_mps, _accel_mps2 = plan_at(leg, station_m)
+        if travel_mps > planned_mps + SPEED_GAP_MPS:
+            speed_gap_us = _older_us(state.speed_gap_us, period_us)
+        if stopping == 0 and abs(speed_mps) < STUCK_MPS:
+            stuck_us = _older_us(state.stuck_us, period_us)
     wrong_direction_us = 0
-    if active and (speed_mps * sigma < -WRONG_DIRECTION_MPS or (driving == 0 and abs(speed_mps) > ROLLING_MPS)):
+    if active and (travel_mps < -WRONG_DIRECTION_MPS or (driving == 0 and abs(speed_mps) > ROLLING_MPS)):
         wrong_direction_us = _older_us(state.wrong_direction_us, period_us)
     rejected_us = 0
     if active and (sys.sys_cmd_timeout != 0 or steer.steer_cmd_timeout != 0 or long.long_cmd_timeout != 0):
@@ -221,8 +210,8 @@ def assess(
             bucket -= 1
 
     magnitude_mps = abs(speed_mps)
-    away_m = abs(cross_m)
-    turned_rad = abs(heading_rad)
+    away_m = abs(cross_track_error_m)
+    turned_rad = abs(heading_error_rad)
     standstill = not motion_lost and not long_lost and long.standstill != 0 and magnitude_mps < STANDSTILL_MPS
 
     present = 0
@@ -250,7 +239,7 @@ def assess(
             present |= 1 << c.VEHICLE_HASH_MISMATCH
     if away_m > START_POSITION_M or abs(station_m) > START_POSITION_M or turned_rad > START_HEADING_RAD:
         present |= 1 << c.POSE_NOT_AT_START
-    if averaged < SETTLED_POSES:
+    if path.averaged < SETTLED_POSES:
         present |= 1 << c.POSE_SETTLING
     if standstill:
         present |= 1 << c.STANDSTILL
@@ -269,9 +258,13 @@ def assess(
         or (active and not sys_lost and vehicle_state != MODE_ACTIVE)
     ):
         present |= 1 << c.VEHICLE_FAULT
-    if disbelieved >= JUMPS_IN_A_ROW:
+    if path.disbelieved >= JUMPS_IN_A_ROW:
         present |= 1 << c.POSE_JUMP
-    if away_m > OFF_PATH_M or turned_rad > OFF_PATH_HEADING_RAD or (moving_allowed and beyond_end_m > BEYOND_END_M):
+    if (
+        away_m > OFF_PATH_M
+        or turned_rad > OFF_PATH_HEADING_RAD
+        or (moving_allowed and station_m - leg.length_m > BEYOND_END_M)
+    ):
         present |= 1 << c.OFF_PATH
     if magnitude_mps > OVER_SPEED_SHARE * tables.car.max_speed_mps + OVER_SPEED_MPS:
         present |= 1 << c.OVER_SPEED
