@@ -102,13 +102,14 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         last_speed_mps,
         _standstill,
     ) = state
+    now_us, used, _sys, steer, motion, long, position, attitude, _oper, _version, _second_controller = inputs
     car = tables.car
     law = tables.law
     last_rad = sent_angles_rad[0]
-    gear_rpt = inputs.long.gear_rpt
-    park_brake_applied = inputs.long.park_brake_applied
-    angle_meas_rad = inputs.steer.road_wheel_angle_meas_rad
-    dt_s = _elapsed_s(last_us, inputs.now_us)
+    gear_rpt = long.gear_rpt
+    park_brake_applied = long.park_brake_applied
+    angle_meas_rad = steer.road_wheel_angle_meas_rad
+    dt_s = _elapsed_s(last_us, now_us)
 
     # Facts, then the decision.
     last_direction = manoeuvre.direction_of(leg_state.leg)
@@ -166,7 +167,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         integral_m2 = 0.0
 
     # Where the car is, and where it will be when this cycle's command acts.
-    travel_mps = sigma * inputs.motion.speed_meas_mps
+    travel_mps = sigma * motion.speed_meas_mps
     if c.has(conditions, c.MOTION_REPORT_TIMEOUT):
         # The car is being stopped, unseen: it is taken to slow down as the brake commands.
         travel_mps = sigma * last_speed_mps
@@ -174,20 +175,20 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     if standstill:
         travel_mps = 0.0
     angle_is_fresh = 0
-    if inputs.used.used_steer_counter != NO_COUNTER and inputs.steer.steer_angle_valid != 0:
+    if used.used_steer_counter != NO_COUNTER and steer.steer_angle_valid != 0:
         angle_is_fresh = 1
     yaw_rate_is_fresh = 0
-    if inputs.used.used_motion_counter != NO_COUNTER and inputs.motion.yaw_rate_valid != 0:
+    if used.used_motion_counter != NO_COUNTER and motion.yaw_rate_valid != 0:
         yaw_rate_is_fresh = 1
-    gains = gains_at(tables.gains, direction, max(travel_mps, 0.0), yaw_rate_is_fresh)
+    gains = gains_at(tables.gains, direction, travel_mps, yaw_rate_is_fresh)
     n = car.command_latency_samples
-    motion = estimator.Motion(
+    moved = estimator.Motion(
         0.5 * (sigma * last_speed_mps + travel_mps) * dt_s,
         dt_s,
         sent_angles_rad[n] + car.late_weight * (sent_angles_rad[n + 1] - sent_angles_rad[n]),
         angle_meas_rad,
         angle_is_fresh,
-        inputs.motion.yaw_rate_meas_radps,
+        motion.yaw_rate_meas_radps,
         yaw_rate_is_fresh,
         1 if standstill else 0,
         1 if follows else 0,
@@ -197,11 +198,11 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         car,
         gains,
         estimated,
-        motion,
+        moved,
         health_state.pose_is_new,
-        inputs.position.position_x_m,
-        inputs.position.position_y_m,
-        inputs.attitude.yaw_rad,
+        position.position_x_m,
+        position.position_y_m,
+        attitude.yaw_rad,
         car.pose_latency_samples if law == LAW_CAR else 0,
     )
     station_m, cross_m, heading_rad, angle_rad = predictor.predict(
@@ -255,7 +256,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         PERIOD_S,
     )
     next_state = State(
-        inputs.now_us,
+        now_us,
         health_state,
         decided,
         leg_state,

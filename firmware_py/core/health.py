@@ -127,12 +127,22 @@ def begin() -> HealthState:
     )
 
 
+NEW = (0, False)
+"""Age of a report that this cycle brought, and that it is not lost."""
+
+
 def _older_us(age_us: int, passed_us: int) -> int:
     """Return an age or a duration that goes on, held at NEVER_US."""
     age_us += passed_us
     if age_us > NEVER_US:
         age_us = NEVER_US
     return age_us
+
+
+def _older(age_us: int, passed_us: int, timeout_us: int) -> tuple[int, bool]:
+    """Return the age of a report that this cycle did not bring, and whether it is lost."""
+    age_us = _older_us(age_us, passed_us)
+    return age_us, age_us >= timeout_us
 
 
 def assess(
@@ -154,67 +164,30 @@ def assess(
     place on the leg, for comparison with the reports.
     """
     _now_us, used, sys, steer, motion, long, position, attitude, oper, version, second_controller = inputs
-    active = mode == MODE_ACTIVE
-    moving_allowed = active and driving != 0
+    timeouts = tables.timeouts
     station_m = path.station_m
     speed_mps = motion.speed_meas_mps
-    travel_mps = leg.sigma * speed_mps
+    magnitude_mps = abs(speed_mps)
     vehicle_state = sys.vehicle_state
+    active = mode == MODE_ACTIVE
+    moving_allowed = active and driving != 0
+    present = 0
 
     # How old each report is: 0 with a new frame that does not say itself that it is invalid.
     sys_n, steer_n, motion_n, long_n, position_n, attitude_n, oper_n, version_n, overruns = used
     sys_us, steer_us, motion_us, long_us, pose_us, oper_us, version_us = state.ages
-    sys_us = 0 if sys_n != NO_COUNTER else _older_us(sys_us, period_us)
-    steer_us = 0 if steer_n != NO_COUNTER and steer.steer_angle_valid != 0 else _older_us(steer_us, period_us)
-    motion_us = 0 if motion_n != NO_COUNTER and motion.speed_valid != 0 else _older_us(motion_us, period_us)
-    long_us = 0 if long_n != NO_COUNTER else _older_us(long_us, period_us)
-    oper_us = 0 if oper_n != NO_COUNTER else _older_us(oper_us, period_us)
-    version_us = 0 if version_n != NO_COUNTER else _older_us(version_us, period_us)
+    steer_is_new = steer_n != NO_COUNTER and steer.steer_angle_valid != 0
+    motion_is_new = motion_n != NO_COUNTER and motion.speed_valid != 0
     # A pose is position and yaw of one sample (equal counters), both of full quality.
     pose_poor = position.position_quality != QUALITY_FIXED or attitude.yaw_quality != QUALITY_FIXED
-    pose_is_new = 1 if position_n != NO_COUNTER and position_n == attitude_n and not pose_poor else 0
-    pose_us = 0 if pose_is_new != 0 else _older_us(pose_us, period_us)
-
-    timeouts = tables.timeouts
-    sys_lost = sys_us >= timeouts.sys_us
-    steer_lost = steer_us >= timeouts.steer_us
-    motion_lost = motion_us >= timeouts.motion_us
-    long_lost = long_us >= timeouts.long_us
-    pose_lost = pose_us >= timeouts.pose_us
-    oper_lost = oper_us >= timeouts.oper_us
-    version_lost = version_us >= timeouts.version_us
-
-    # What may not last.
-    steering_gap_us = 0
-    if active and abs(steer.road_wheel_angle_meas_rad - path.modelled_angle_rad) > STEERING_GAP_RAD:
-        steering_gap_us = _older_us(state.steering_gap_us, period_us)
-    speed_gap_us = 0
-    stuck_us = 0
-    if moving_allowed:
-        planned_mps, _accel_mps2 = plan_at(leg, station_m)
-        if travel_mps > planned_mps + SPEED_GAP_MPS:
-            speed_gap_us = _older_us(state.speed_gap_us, period_us)
-        if stopping == 0 and abs(speed_mps) < STUCK_MPS:
-            stuck_us = _older_us(state.stuck_us, period_us)
-    wrong_direction_us = 0
-    if active and (travel_mps < -WRONG_DIRECTION_MPS or (driving == 0 and abs(speed_mps) > ROLLING_MPS)):
-        wrong_direction_us = _older_us(state.wrong_direction_us, period_us)
-    rejected_us = 0
-    if active and (sys.sys_cmd_timeout != 0 or steer.steer_cmd_timeout != 0 or long.long_cmd_timeout != 0):
-        rejected_us = _older_us(state.rejected_us, period_us)
-    bucket = state.overrun_bucket + overruns
-    leak = state.overrun_leak + 1
-    if leak >= OVERRUN_LEAK_CYCLES:
-        leak = 0
-        if bucket > 0:
-            bucket -= 1
-
-    magnitude_mps = abs(speed_mps)
-    away_m = abs(cross_track_error_m)
-    turned_rad = abs(heading_error_rad)
-    standstill = not motion_lost and not long_lost and long.standstill != 0 and magnitude_mps < STANDSTILL_MPS
-
-    present = 0
+    pose_is_new = position_n != NO_COUNTER and position_n == attitude_n and not pose_poor
+    sys_us, sys_lost = NEW if sys_n != NO_COUNTER else _older(sys_us, period_us, timeouts.sys_us)
+    steer_us, steer_lost = NEW if steer_is_new else _older(steer_us, period_us, timeouts.steer_us)
+    motion_us, motion_lost = NEW if motion_is_new else _older(motion_us, period_us, timeouts.motion_us)
+    long_us, long_lost = NEW if long_n != NO_COUNTER else _older(long_us, period_us, timeouts.long_us)
+    pose_us, pose_lost = NEW if pose_is_new else _older(pose_us, period_us, timeouts.pose_us)
+    oper_us, oper_lost = NEW if oper_n != NO_COUNTER else _older(oper_us, period_us, timeouts.oper_us)
+    version_us, version_lost = NEW if version_n != NO_COUNTER else _older(version_us, period_us, timeouts.version_us)
     if sys_lost or steer_lost or motion_lost or long_lost or pose_lost or version_lost:
         present |= 1 << c.WAITING_FOR_REPORTS
         if sys_lost:
@@ -237,47 +210,67 @@ def assess(
             present |= 1 << c.DBC_HASH_MISMATCH
         if version.veh_vehicle_hash != tables.vehicle_hash24:
             present |= 1 << c.VEHICLE_HASH_MISMATCH
-    if away_m > START_POSITION_M or abs(station_m) > START_POSITION_M or turned_rad > START_HEADING_RAD:
-        present |= 1 << c.POSE_NOT_AT_START
-    if path.averaged < SETTLED_POSES:
-        present |= 1 << c.POSE_SETTLING
-    if standstill:
+
+    # What a driven car may not do for long.
+    steering_gap_us = 0
+    speed_gap_us = 0
+    wrong_direction_us = 0
+    rejected_us = 0
+    stuck_us = 0
+    if active:
+        travel_mps = leg.sigma * speed_mps
+        if abs(steer.road_wheel_angle_meas_rad - path.modelled_angle_rad) > STEERING_GAP_RAD:
+            steering_gap_us = _older_us(state.steering_gap_us, period_us)
+            if steering_gap_us >= STEERING_GAP_US:
+                present |= 1 << c.STEERING_NOT_FOLLOWING
+        if driving != 0:
+            planned_mps, _accel_mps2 = plan_at(leg, station_m)
+            if travel_mps > planned_mps + SPEED_GAP_MPS:
+                speed_gap_us = _older_us(state.speed_gap_us, period_us)
+            if stopping == 0 and magnitude_mps < STUCK_MPS:
+                stuck_us = _older_us(state.stuck_us, period_us)
+            if speed_gap_us >= SPEED_GAP_US or stuck_us >= STUCK_US:
+                present |= 1 << c.SPEED_NOT_FOLLOWING
+        if travel_mps < -WRONG_DIRECTION_MPS or (driving == 0 and magnitude_mps > ROLLING_MPS):
+            wrong_direction_us = _older_us(state.wrong_direction_us, period_us)
+            if wrong_direction_us >= WRONG_DIRECTION_US:
+                present |= 1 << c.WRONG_DIRECTION
+        if sys.sys_cmd_timeout != 0 or steer.steer_cmd_timeout != 0 or long.long_cmd_timeout != 0:
+            rejected_us = _older_us(state.rejected_us, period_us)
+            if rejected_us >= REJECTED_US:
+                present |= 1 << c.COMMAND_REJECTED
+
+    # Where the car is, and how fast.
+    away_m = abs(cross_track_error_m)
+    turned_rad = abs(heading_error_rad)
+    if not motion_lost and not long_lost and long.standstill != 0 and magnitude_mps < STANDSTILL_MPS:
         present |= 1 << c.STANDSTILL
     else:
         present |= 1 << c.NOT_AT_STANDSTILL
+    if away_m > START_POSITION_M or abs(station_m) > START_POSITION_M or turned_rad > START_HEADING_RAD:
+        present |= 1 << c.POSE_NOT_AT_START
+    if away_m > OFF_PATH_M or turned_rad > OFF_PATH_HEADING_RAD:
+        present |= 1 << c.OFF_PATH
+    if moving_allowed and station_m - leg.length_m > BEYOND_END_M:
+        present |= 1 << c.OFF_PATH
+    if path.averaged < SETTLED_POSES:
+        present |= 1 << c.POSE_SETTLING
+    if path.disbelieved >= JUMPS_IN_A_ROW:
+        present |= 1 << c.POSE_JUMP
+    if magnitude_mps > OVER_SPEED_SHARE * tables.car.max_speed_mps + OVER_SPEED_MPS:
+        present |= 1 << c.OVER_SPEED
+
+    # What the vehicle says of itself, and who may interfere.
     if vehicle_state != MODE_READY:
         present |= 1 << c.VEHICLE_NOT_READY
     if not sys_lost and vehicle_state == MODE_ACTIVE:
         present |= 1 << c.VEHICLE_ACTIVE
+    if vehicle_state == MODE_FAULT or steer.steer_fault != 0 or long.long_fault != 0:
+        present |= 1 << c.VEHICLE_FAULT
+    if active and not sys_lost and vehicle_state != MODE_ACTIVE:
+        present |= 1 << c.VEHICLE_FAULT
     if sys.driver_override != 0 or steer.steer_override != 0 or long.brake_override != 0:
         present |= 1 << c.DRIVER_OVERRIDE
-    if (
-        vehicle_state == MODE_FAULT
-        or steer.steer_fault != 0
-        or long.long_fault != 0
-        or (active and not sys_lost and vehicle_state != MODE_ACTIVE)
-    ):
-        present |= 1 << c.VEHICLE_FAULT
-    if path.disbelieved >= JUMPS_IN_A_ROW:
-        present |= 1 << c.POSE_JUMP
-    if (
-        away_m > OFF_PATH_M
-        or turned_rad > OFF_PATH_HEADING_RAD
-        or (moving_allowed and station_m - leg.length_m > BEYOND_END_M)
-    ):
-        present |= 1 << c.OFF_PATH
-    if magnitude_mps > OVER_SPEED_SHARE * tables.car.max_speed_mps + OVER_SPEED_MPS:
-        present |= 1 << c.OVER_SPEED
-    if steering_gap_us >= STEERING_GAP_US:
-        present |= 1 << c.STEERING_NOT_FOLLOWING
-    if speed_gap_us >= SPEED_GAP_US or stuck_us >= STUCK_US:
-        present |= 1 << c.SPEED_NOT_FOLLOWING
-    if wrong_direction_us >= WRONG_DIRECTION_US:
-        present |= 1 << c.WRONG_DIRECTION
-    if overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET:
-        present |= 1 << c.CYCLE_OVERRUN
-    if rejected_us >= REJECTED_US:
-        present |= 1 << c.COMMAND_REJECTED
     if second_controller != 0:
         present |= 1 << c.SECOND_CONTROLLER
     start, stop, emergency_stop, clear = oper
@@ -290,6 +283,16 @@ def assess(
         present |= 1 << c.START_PRESSED
     if clear != 0 and state.clear_was_pressed == 0 and not oper_lost:
         present |= 1 << c.CLEAR_PRESSED
+
+    # Whether this controller keeps its own time.
+    bucket = state.overrun_bucket + overruns
+    leak = state.overrun_leak + 1
+    if leak >= OVERRUN_LEAK_CYCLES:
+        leak = 0
+        if bucket > 0:
+            bucket -= 1
+    if overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET:
+        present |= 1 << c.CYCLE_OVERRUN
     next_state = HealthState(
         Ages(sys_us, steer_us, motion_us, long_us, pose_us, oper_us, version_us),
         steering_gap_us,
@@ -301,6 +304,6 @@ def assess(
         stuck_us,
         start,
         clear,
-        pose_is_new,
+        1 if pose_is_new else 0,
     )
     return next_state, present
