@@ -37,8 +37,10 @@ what a busy neighbour of the CPU takes from the caches meanwhile is fetched agai
 REHEARSAL_MARGIN_NS = 50_000
 """A rehearsal begins only where the longest of late would end so long before the deadline."""
 
-LONGEST_KEPT = 0.999
-"""The longest rehearsal of late is forgotten by so much a cycle: half of it in seven seconds."""
+FIRST_KEPT = 0.999
+AGAIN_KEPT = 0.99
+"""By so much a cycle the longest first rehearsal of late is forgotten, half of it in seven seconds, and the longest of
+those after it, half in 0.7: when they take longer than the first, the machine was away, and that is over."""
 
 REGATHER_S = 0.001
 """After a stall, so long is given to peers that stalled with us before their silence is judged."""
@@ -109,18 +111,17 @@ class Pace:
     def _rehearsed(self, rehearse: Callable[[], None], now_ns: int, deadline_ns: int) -> int:
         """Rehearse for as long as there is time for one more; return the time."""
         longest_ns = self._longest_ns
-        longest_ns[0] *= LONGEST_KEPT
-        longest_ns[1] *= LONGEST_KEPT
+        longest_ns[0] *= FIRST_KEPT
+        longest_ns[1] *= AGAIN_KEPT
         again = 0
         while now_ns + longest_ns[again] + REHEARSAL_MARGIN_NS < deadline_ns:
             rehearse()
             begun_ns, now_ns = now_ns, self._clock.now_ns()
             self.rehearsal.add(now_ns - begun_ns)
             self.rehearsals += 1
-            longest_ns[again] = max(longest_ns[again], float(now_ns - begun_ns))
-            if now_ns > deadline_ns:
-                # A machine that is too slow for it, or was away, is left alone for some seconds.
-                longest_ns[:] = [2.0 * (REHEARSED_NS + self._spin_ns)] * 2
+            # A machine that is too slow for it, or was away, is left alone for some time.
+            took_ns = now_ns - begun_ns if now_ns <= deadline_ns else 2 * (REHEARSED_NS + self._spin_ns)
+            longest_ns[again] = max(longest_ns[again], float(took_ns))
             again = 1
         return now_ns
 

@@ -116,6 +116,22 @@ def test_a_long_rehearsal_is_not_tried_again_until_it_would_fit() -> None:
     assert rehearsal.begun_ns[1] > 500 * PERIOD_NS
 
 
+def test_a_machine_that_was_away_during_a_later_one_rehearses_once_at_once_and_soon_again_as_before() -> None:
+    clock = VirtualClock()
+    rehearsal = Rehearsal(clock, 150_000)
+    pace = Pace(clock, SPIN_NS, rehearsal)
+    wait(pace, 1500)
+    counts = []
+    for number in range(1501, 1800):
+        begun = pace.rehearsals
+        rehearsal.duration_ns = 3_000_000 if number == 1501 else 150_000
+        late_ns = pace.wait_until(number * PERIOD_NS) - number * PERIOD_NS
+        assert (late_ns > READING_NS) == (number == 1501)
+        counts.append(pace.rehearsals - begun)
+    assert counts[:2] == [2, 1]
+    assert min(counts[200:]) >= 4
+
+
 def test_without_it_there_is_none() -> None:
     clock = VirtualClock()
     pace = Pace(clock)

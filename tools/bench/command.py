@@ -162,8 +162,8 @@ class Bench:
         self.notes.append(
             "tick_cold: the core's cycle as the loop runs it under SCHED_FIFO: rehearsed on the inputs of the cycle "
             "before, as often as it fits in before its deadline, in place of most of the spin. tick_unrehearsed: "
-            "straight after its sleep, as is the compiled floor of both: tick_cold is the loop's way against a compiled "
-            "cycle without it"
+            "straight after its sleep, as is the compiled floor of both: tick_cold is the loop's way against a "
+            "compiled cycle without it"
         )
 
     def _tick(self, worker: _Worker) -> None:
