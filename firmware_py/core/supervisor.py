@@ -149,7 +149,7 @@ def begin() -> SupervisorState:
 def find_transition(mode: int, conditions: int) -> int:
     """Return the row of TRANSITIONS that decides for a mode, or -1 where the mode stays."""
     if _ANY_REQUIRED[mode] != -1 and (conditions & _ANY_REQUIRED[mode]) == 0:
-        return -1  # nothing has happened: by far the most cycles, without a look at each row
+        return -1  # nothing has happened: no need to look at each row
     for row in range(_FIRST_ROW[mode], _END_ROW[mode]):
         if (conditions & TRANSITIONS[row][1]) == TRANSITIONS[row][1] and (conditions & TRANSITIONS[row][2]) == 0:
             return row
@@ -162,6 +162,8 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
     From Ready, a pressed start asks the vehicle to enable; Active begins when the vehicle reports Active. A start that
     the vehicle does not answer within ENABLE_TIMEOUT_US is withdrawn.
     """
+    if state.mode == MODE_ACTIVE and (conditions & _ANY_REQUIRED[MODE_ACTIVE]) == 0 and state.clearing_us == 0:
+        return state  # driving, and nothing has happened: by far the most cycles
     mode, shown_reason, reaction, enabling, enabling_us, clearing_us, released, fault_us = state
     seen = conditions & ~(1 << c.START_PRESSED)
     if mode == MODE_READY:
