@@ -28,10 +28,13 @@ from firmware_py.core.signals import (
     NO_COUNTER,
     Inputs,
     LongCommand,
+    MotionReport,
     Outputs,
     SteerCommand,
+    SteerReport,
     SysCommand,
     Track,
+    UsedCounters,
 )
 from firmware_py.core.tables import LAW_CAR, LAW_PAPER, CarTable, Tables
 
@@ -174,25 +177,18 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         travel_mps = max(travel_mps - car.controlled_decel_mps2 * dt_s, 0.0)
     if standstill:
         travel_mps = 0.0
-    angle_is_fresh = 0
-    if used.used_steer_counter != NO_COUNTER and steer.steer_angle_valid != 0:
-        angle_is_fresh = 1
-    yaw_rate_is_fresh = 0
-    if used.used_motion_counter != NO_COUNTER and motion.yaw_rate_valid != 0:
-        yaw_rate_is_fresh = 1
-    gains = gains_at(tables.gains, direction, travel_mps, yaw_rate_is_fresh)
-    n = car.command_latency_samples
-    moved = estimator.Motion(
+    moved = _moved(
+        car,
+        used,
+        steer,
+        motion,
         0.5 * (sigma * last_speed_mps + travel_mps) * dt_s,
         dt_s,
-        sent_angles_rad[n] + car.late_weight * (sent_angles_rad[n + 1] - sent_angles_rad[n]),
-        angle_meas_rad,
-        angle_is_fresh,
-        motion.yaw_rate_meas_radps,
-        yaw_rate_is_fresh,
-        1 if standstill else 0,
-        1 if follows else 0,
+        sent_angles_rad,
+        standstill,
+        follows,
     )
+    gains = gains_at(tables.gains, direction, travel_mps, moved.yaw_rate_is_fresh)
     estimated = estimator.estimate(
         leg,
         car,
@@ -280,6 +276,39 @@ def _elapsed_s(last_us: int, now_us: int) -> float:
     if last_us < 0:
         return PERIOD_S
     return bounded((now_us - last_us) * 1e-6, 0.0, LONGEST_CYCLE_S)
+
+
+def _moved(
+    car: CarTable,
+    used: UsedCounters,
+    steer: SteerReport,
+    motion: MotionReport,
+    odometry_m: float,
+    dt_s: float,
+    sent_angles_rad: tuple[float, ...],
+    standstill: bool,
+    follows: bool,
+) -> estimator.Motion:
+    """Return what this cycle's reports tell of the motion since the last one's."""
+    n = car.command_latency_samples
+    acted_angle_rad = sent_angles_rad[n] + car.late_weight * (sent_angles_rad[n + 1] - sent_angles_rad[n])
+    angle_is_fresh = 0
+    if used.used_steer_counter != NO_COUNTER and steer.steer_angle_valid != 0:
+        angle_is_fresh = 1
+    yaw_rate_is_fresh = 0
+    if used.used_motion_counter != NO_COUNTER and motion.yaw_rate_valid != 0:
+        yaw_rate_is_fresh = 1
+    return estimator.Motion(
+        odometry_m,
+        dt_s,
+        acted_angle_rad,
+        steer.road_wheel_angle_meas_rad,
+        angle_is_fresh,
+        motion.yaw_rate_meas_radps,
+        yaw_rate_is_fresh,
+        1 if standstill else 0,
+        1 if follows else 0,
+    )
 
 
 def _steering(
