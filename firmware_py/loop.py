@@ -90,7 +90,7 @@ class Pace:
         self._clock = clock
         self._spin_ns = spin_ns
         self._rehearse = rehearse
-        self._longest_ns = [0.5 * REHEARSED_NS, 0.5 * REHEARSED_NS]
+        self._longest_ns = [0.5 * REHEARSED_NS, 0.25 * REHEARSED_NS]
         self.rehearsal = Histogram()
         self.rehearsals = 0
 
