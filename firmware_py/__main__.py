@@ -62,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="use of SCHED_FIFO (required on a physical interface, auto on loopbus, virtual and vcan*)",
     )
     parser.add_argument(
-        "--no-rehearsal", action="store_true", help="do not run each cycle's work twice before its time (SCHED_FIFO)"
+        "--no-rehearsal", action="store_true", help="do not run each cycle's work before its time too (SCHED_FIFO)"
     )
     parser.add_argument("--cpu", type=int, metavar="N", help="stay on this CPU")
     parser.add_argument(

@@ -2,8 +2,8 @@
 
 Cycles start on multiples of the period of the monotonic clock. A cycle that starts late by whole periods skips them;
 it never bursts. After such a stall the loop drains once more, so that what the peers sent meanwhile is not missed.
-Under SCHED_FIFO the cycle's work is rehearsed shortly before each deadline: after 10 ms of sleep the caches hold other
-people's code, and what the cycle itself would wait for is fetched before there is anything to be late for.
+Under SCHED_FIFO the cycle's work is rehearsed until shortly before each deadline: after 10 ms of sleep the caches hold
+other people's code, and what the cycle itself would wait for is fetched before there is anything to be late for.
 """
 
 import json
@@ -29,17 +29,18 @@ PERIOD_NS = 10_000_000
 SPIN_NS = 200_000
 """Busy wait before each deadline, under SCHED_FIFO only: without it the scheduler takes the CPU from who burns it."""
 
-REHEARSALS = 2
-"""Rehearsals before each deadline: the first fetches code and data, the second is as quick as a third would be."""
-
 REHEARSED_NS = 600_000
-"""So long before the spin the loop wakes to rehearse; two take about 0.4 ms. Whoever is late rehearses less or not."""
+"""So long before the spin the loop wakes to rehearse. The first rehearsal fetches code and data and takes twice as long
+as those after it; these take the place of the spin, whose time would be burned anyhow, for as long as one more fits in:
+what a busy neighbour of the CPU takes from the caches meanwhile is fetched again. Whoever is late rehearses less."""
 
 REHEARSAL_MARGIN_NS = 50_000
 """A rehearsal begins only where the longest of late would end so long before the deadline."""
 
-LONGEST_KEPT = 0.999
-"""The longest rehearsal of late is forgotten by so much a cycle: half of it in seven seconds."""
+FIRST_KEPT = 0.999
+AGAIN_KEPT = 0.99
+"""By so much a cycle the longest first rehearsal of late is forgotten, half of it in seven seconds, and the longest of
+those after it, half in 0.7: when they take longer than the first, the machine was away, and that is over."""
 
 REGATHER_S = 0.001
 """After a stall, so long is given to peers that stalled with us before their silence is judged."""
@@ -81,14 +82,15 @@ class Pace:
     """Waits for deadlines: sleeps, rehearses, spins.
 
     `rehearse` is the work that the deadline is for, without any effect; None for none of it, and it must not raise. One
-    begins only where what is left is more than the longest one of late: the first that is longer may be late, once.
+    begins only where what is left is more than the longest one of late: the first that is longer may be late, once. Of
+    the first before a deadline, which has the caches to fill, and of those after it the longest is kept apart.
     """
 
     def __init__(self, clock: Clock, spin_ns: int = 0, rehearse: Callable[[], None] | None = None) -> None:
         self._clock = clock
         self._spin_ns = spin_ns
         self._rehearse = rehearse
-        self._longest_ns = 0.5 * REHEARSED_NS
+        self._longest_ns = [0.5 * REHEARSED_NS, 0.25 * REHEARSED_NS]
         self.rehearsal = Histogram()
         self.rehearsals = 0
 
@@ -107,18 +109,20 @@ class Pace:
         return now_ns
 
     def _rehearsed(self, rehearse: Callable[[], None], now_ns: int, deadline_ns: int) -> int:
-        """Rehearse as often as is of use and there is time for; return the time."""
-        self._longest_ns *= LONGEST_KEPT
-        for _ in range(REHEARSALS):
-            if now_ns + self._longest_ns + REHEARSAL_MARGIN_NS >= deadline_ns:
-                break
+        """Rehearse for as long as there is time for one more; return the time."""
+        longest_ns = self._longest_ns
+        longest_ns[0] *= FIRST_KEPT
+        longest_ns[1] *= AGAIN_KEPT
+        again = 0
+        while now_ns + longest_ns[again] + REHEARSAL_MARGIN_NS < deadline_ns:
             rehearse()
             begun_ns, now_ns = now_ns, self._clock.now_ns()
             self.rehearsal.add(now_ns - begun_ns)
             self.rehearsals += 1
-            # A machine that is too slow for it, or was away, is left alone for some seconds.
-            longest_ns = now_ns - begun_ns if now_ns <= deadline_ns else 2 * (REHEARSED_NS + self._spin_ns)
-            self._longest_ns = max(self._longest_ns, float(longest_ns))
+            # A machine that is too slow for it, or was away, is left alone for some time.
+            took_ns = now_ns - begun_ns if now_ns <= deadline_ns else 2 * (REHEARSED_NS + self._spin_ns)
+            longest_ns[again] = max(longest_ns[again], float(took_ns))
+            again = 1
         return now_ns
 
 

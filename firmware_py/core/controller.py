@@ -14,7 +14,7 @@ from firmware_py.core import estimator, health, limits, manoeuvre, paper_law, pi
 from firmware_py.core import gate as last_gate
 from firmware_py.core.bounds import bounded
 from firmware_py.core.motion import QUEUE_LENGTH
-from firmware_py.core.path import feedforward_at, plan_at
+from firmware_py.core.path import feedforward_at
 from firmware_py.core.schedule import gains_at
 from firmware_py.core.signals import (
     GEAR_NONE,
@@ -28,10 +28,13 @@ from firmware_py.core.signals import (
     NO_COUNTER,
     Inputs,
     LongCommand,
+    MotionReport,
     Outputs,
     SteerCommand,
+    SteerReport,
     SysCommand,
     Track,
+    UsedCounters,
 )
 from firmware_py.core.tables import LAW_CAR, LAW_PAPER, CarTable, Tables
 
@@ -87,68 +90,127 @@ def begin() -> State:
 
 def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     """Return the next state and the commands of this cycle."""
+    (
+        last_us,
+        health_state,
+        decided,
+        leg_state,
+        estimated,
+        reference,
+        integral_m2,
+        paper,
+        _limited,
+        sent_angles_rad,
+        angle_carry_rad,
+        last_speed_mps,
+        _standstill,
+    ) = state
+    now_us, used, _sys, steer, motion, long, position, attitude, _oper, _version, _second_controller = inputs
     car = tables.car
-    dt_s = _elapsed_s(state.last_us, inputs.now_us)
+    law = tables.law
+    last_rad = sent_angles_rad[0]
+    gear_rpt = long.gear_rpt
+    park_brake_applied = long.park_brake_applied
+    angle_meas_rad = steer.road_wheel_angle_meas_rad
+    dt_s = _elapsed_s(last_us, now_us)
 
     # Facts, then the decision.
-    health_state, conditions = health.assess(tables, state.health, inputs, _believed(tables, state), PERIOD_US)
-    if state.manoeuvre.gear_failed != 0:
+    last_direction = manoeuvre.direction_of(leg_state.leg)
+    kept_cross_m, kept_heading_rad = estimated.cross_track_error_m, estimated.heading_error_rad
+    if law == LAW_PAPER and leg_state.driving != 0:
+        # What this law keeps to its path is the centre of gravity.
+        kept_cross_m, kept_heading_rad = paper.cross_track_error_m, paper.heading_error_rad
+    health_state, conditions = health.assess(
+        tables,
+        health_state,
+        inputs,
+        tables.leg[last_direction],
+        decided.mode,
+        leg_state.driving,
+        reference.stopping,
+        estimated,
+        kept_cross_m,
+        kept_heading_rad,
+        PERIOD_US,
+    )
+    if leg_state.gear_failed != 0:
         conditions |= 1 << c.DIRECTION_CHANGE_TIMEOUT
-    if manoeuvre.is_done(state.manoeuvre, inputs.long.gear_rpt, inputs.long.park_brake_applied):
+    if manoeuvre.is_done(leg_state, gear_rpt, park_brake_applied):
         conditions |= 1 << c.MANOEUVRE_DONE
-    decided = supervisor.decide(state.supervisor, conditions, PERIOD_US)
+    decided = supervisor.decide(decided, conditions, PERIOD_US)
+    mode = decided.mode
     standstill = c.has(conditions, c.STANDSTILL)
-    active = decided.mode == MODE_ACTIVE
-    stopping_on_path = decided.mode == MODE_FAULT
+    active = mode == MODE_ACTIVE
+    follows = active or mode == MODE_FAULT  # in Fault the car stops on its path
 
     # The leg, and what changes with it.
-    leg_state = _manoeuvre(state, car, inputs, decided.mode, standstill)
+    if active:
+        leg_state = manoeuvre.proceed(
+            leg_state,
+            car,
+            gear_rpt,
+            park_brake_applied,
+            standstill,
+            reference.stopping,
+            angle_meas_rad - last_rad,
+            PERIOD_US,
+        )
+    elif mode == MODE_FAULT:
+        leg_state = manoeuvre.keep(leg_state)
+    else:
+        leg_state = manoeuvre.begin()
     direction = manoeuvre.direction_of(leg_state.leg)
     leg = tables.leg[direction]
-    estimated = state.estimator
-    reference = state.speed
-    integral_m2 = state.integral_m2
-    if direction != manoeuvre.direction_of(state.manoeuvre.leg):
+    sigma = leg.sigma
+    if direction != last_direction:
         estimated = estimator.turn_round(leg, estimated)
         reference = speed.begin(estimated.station_m)
-    if not active and not stopping_on_path:
+    if not follows:
         reference = speed.begin(estimated.station_m)
         integral_m2 = 0.0
 
     # Where the car is, and where it will be when this cycle's command acts.
-    travel_mps = leg.sigma * inputs.motion.speed_meas_mps
+    travel_mps = sigma * motion.speed_meas_mps
     if c.has(conditions, c.MOTION_REPORT_TIMEOUT):
         # The car is being stopped, unseen: it is taken to slow down as the brake commands.
-        travel_mps = leg.sigma * state.speed_mps
+        travel_mps = sigma * last_speed_mps
         travel_mps = max(travel_mps - car.controlled_decel_mps2 * dt_s, 0.0)
     if standstill:
         travel_mps = 0.0
-    is_fresh = 0
-    if inputs.used.used_motion_counter != NO_COUNTER and inputs.motion.yaw_rate_valid != 0:
-        is_fresh = 1
-    gains = gains_at(tables.gains, direction, max(travel_mps, 0.0), is_fresh)
+    moved = _moved(
+        car,
+        used,
+        steer,
+        motion,
+        0.5 * (sigma * last_speed_mps + travel_mps) * dt_s,
+        dt_s,
+        sent_angles_rad,
+        standstill,
+        follows,
+    )
+    gains = gains_at(tables.gains, direction, travel_mps, moved.yaw_rate_is_fresh)
     estimated = estimator.estimate(
         leg,
         car,
         gains,
         estimated,
-        _motion(car, leg.sigma, state, inputs, travel_mps, is_fresh, standstill, active or stopping_on_path, dt_s),
+        moved,
         health_state.pose_is_new,
-        inputs.position.position_x_m,
-        inputs.position.position_y_m,
-        inputs.attitude.yaw_rad,
-        car.pose_latency_samples if tables.law == LAW_CAR else 0,
+        position.position_x_m,
+        position.position_y_m,
+        attitude.yaw_rad,
+        car.pose_latency_samples if law == LAW_CAR else 0,
     )
     station_m, cross_m, heading_rad, angle_rad = predictor.predict(
-        leg, car, estimated, state.sent_angles_rad, travel_mps, PERIOD_S
+        leg, car, estimated, sent_angles_rad, travel_mps, PERIOD_S
     )
-    if tables.law != LAW_CAR:
+    if law != LAW_CAR:
         cross_m = estimated.cross_track_error_m
         heading_rad = estimated.heading_error_rad
 
     # Steering: feedforward + PID - disturbance, within the limits.
     feedforward_1pm, slope_1pm2 = feedforward_at(leg, station_m + travel_mps * MEAN_AGE_S)
-    feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral_m2, gains, leg.sigma)
+    feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral_m2, gains, sigma)
     wanted_rad = _steering(
         car,
         feedforward_1pm,
@@ -157,43 +219,40 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         travel_mps,
         estimated.road_disturbance_rad,
         angle_rad,
-        tables.law,
+        law,
     )
     wanted_rad = (wanted_rad - estimated.steering_offset_rad) / estimated.steering_gain
-    paper = state.paper
-    if tables.law == LAW_PAPER:
+    if law == LAW_PAPER:
         believed = health_state.pose_is_new != 0 and estimated.disbelieved == 0
         paper, wanted_rad = _paper_steering(tables, state, inputs, estimated, believed, direction, travel_mps)
-    if not active and not stopping_on_path:
-        wanted_rad = inputs.steer.road_wheel_angle_meas_rad
-    limited = limits.limit_angle(car, wanted_rad, state.sent_angles_rad[0], PERIOD_S)
-    preview_m = pid.preview_error_m(cross_m, heading_rad, gains.preview_m, leg.sigma)
-    held = 1 if limited.limited != 0 or abs(cross_m) > pid.CROSS_TRACK_MAX_M else 0
+    if not follows:
+        wanted_rad = angle_meas_rad
+    wanted_rad, limited = limits.limit_angle(car, wanted_rad, last_rad, PERIOD_S)
+    preview_m = pid.preview_error_m(cross_m, heading_rad, gains.preview_m, sigma)
+    held = 1 if limited != 0 or abs(cross_m) > pid.CROSS_TRACK_MAX_M else 0
     integral_m2 = pid.integrate_m2(integral_m2, preview_m, travel_mps * dt_s, gains, held)
 
     # Speed, then the last word.
-    station_now_m = estimated.station_m + travel_mps * REPORT_AGE_S
-    speed_command = speed.hold()
+    wanted_mps, brake_mps2 = 0.0, speed.HOLD_DECEL_MPS2
     if active and leg_state.driving != 0:
-        reference, speed_command = speed.follow(leg, car, reference, station_now_m, travel_mps, dt_s)
-    passed = last_gate.gate(
+        station_now_m = estimated.station_m + travel_mps * REPORT_AGE_S
+        reference, wanted_mps, brake_mps2 = speed.follow(leg, car, reference, station_now_m, travel_mps, dt_s)
+    sent_rad, angle_carry_rad, speed_mps, brake_mps2, follow = last_gate.gate(
         car,
         tables.road_wheel_angle_lsb_rad,
-        decided.mode,
+        mode,
         decided.reaction,
         decided.released,
-        leg.sigma,
-        last_gate.Wanted(
-            limited.angle_rad,
-            speed_command.travel_speed_mps,
-            speed_command.brake_decel_mps2,
-        ),
-        state.sent_angles_rad[0],
-        state.angle_carry_rad,
+        sigma,
+        wanted_rad,
+        wanted_mps,
+        brake_mps2,
+        last_rad,
+        angle_carry_rad,
         PERIOD_S,
     )
     next_state = State(
-        inputs.now_us,
+        now_us,
         health_state,
         decided,
         leg_state,
@@ -201,13 +260,15 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         reference,
         integral_m2,
         paper,
-        limited.limited,
-        (passed.angle_rad, *state.sent_angles_rad[:-1]),
-        passed.angle_carry_rad,
-        leg.sigma * travel_mps,
+        limited,
+        (sent_rad, *sent_angles_rad[:-1]),
+        angle_carry_rad,
+        sigma * travel_mps,
         1 if standstill else 0,
     )
-    return next_state, _outputs(decided, leg_state, passed, estimated, car.wheelbase_m, standstill)
+    return next_state, _outputs(
+        decided, leg_state.leg, sent_rad, speed_mps, brake_mps2, follow, estimated, car.wheelbase_m, standstill
+    )
 
 
 def _elapsed_s(last_us: int, now_us: int) -> float:
@@ -217,75 +278,33 @@ def _elapsed_s(last_us: int, now_us: int) -> float:
     return bounded((now_us - last_us) * 1e-6, 0.0, LONGEST_CYCLE_S)
 
 
-def _believed(tables: Tables, state: State) -> health.Believed:
-    path = state.estimator
-    leg = tables.leg[manoeuvre.direction_of(state.manoeuvre.leg)]
-    planned_mps, _accel_mps2 = plan_at(leg, path.station_m)
-    cross_m = path.cross_track_error_m
-    heading_rad = path.heading_error_rad
-    if tables.law == LAW_PAPER and state.manoeuvre.driving != 0:
-        # What this law keeps to its path is the centre of gravity.
-        cross_m = state.paper.cross_track_error_m
-        heading_rad = state.paper.heading_error_rad
-    return health.Believed(
-        state.supervisor.mode,
-        leg.sigma,
-        state.manoeuvre.driving,
-        state.speed.stopping,
-        planned_mps,
-        path.station_m - leg.length_m,
-        cross_m,
-        heading_rad,
-        path.station_m,
-        path.disbelieved,
-        path.averaged,
-        path.modelled_angle_rad,
-    )
-
-
-def _manoeuvre(state: State, car: CarTable, inputs: Inputs, mode: int, standstill: bool) -> manoeuvre.ManoeuvreState:
-    """Return the manoeuvre's next state: it proceeds in Active, is kept in Fault, and is over in Manual and Ready."""
-    if mode == MODE_ACTIVE:
-        steering_gap_rad = inputs.steer.road_wheel_angle_meas_rad - state.sent_angles_rad[0]
-        return manoeuvre.proceed(
-            state.manoeuvre,
-            car,
-            inputs.long.gear_rpt,
-            inputs.long.park_brake_applied,
-            standstill,
-            state.speed.stopping,
-            steering_gap_rad,
-            PERIOD_US,
-        )
-    if mode == MODE_FAULT:
-        kept = state.manoeuvre
-        return manoeuvre.ManoeuvreState(kept.leg, 0, 0, 0, 0)
-    return manoeuvre.begin()
-
-
-def _motion(
+def _moved(
     car: CarTable,
-    sigma: float,
-    state: State,
-    inputs: Inputs,
-    travel_mps: float,
-    yaw_rate_is_fresh: int,
+    used: UsedCounters,
+    steer: SteerReport,
+    motion: MotionReport,
+    odometry_m: float,
+    dt_s: float,
+    sent_angles_rad: tuple[float, ...],
     standstill: bool,
     follows: bool,
-    dt_s: float,
 ) -> estimator.Motion:
     """Return what this cycle's reports tell of the motion since the last one's."""
     n = car.command_latency_samples
+    acted_angle_rad = sent_angles_rad[n] + car.late_weight * (sent_angles_rad[n + 1] - sent_angles_rad[n])
     angle_is_fresh = 0
-    if inputs.used.used_steer_counter != NO_COUNTER and inputs.steer.steer_angle_valid != 0:
+    if used.used_steer_counter != NO_COUNTER and steer.steer_angle_valid != 0:
         angle_is_fresh = 1
+    yaw_rate_is_fresh = 0
+    if used.used_motion_counter != NO_COUNTER and motion.yaw_rate_valid != 0:
+        yaw_rate_is_fresh = 1
     return estimator.Motion(
-        0.5 * (sigma * state.speed_mps + travel_mps) * dt_s,
+        odometry_m,
         dt_s,
-        state.sent_angles_rad[n] + car.late_weight * (state.sent_angles_rad[n + 1] - state.sent_angles_rad[n]),
-        inputs.steer.road_wheel_angle_meas_rad,
+        acted_angle_rad,
+        steer.road_wheel_angle_meas_rad,
         angle_is_fresh,
-        inputs.motion.yaw_rate_meas_radps,
+        motion.yaw_rate_meas_radps,
         yaw_rate_is_fresh,
         1 if standstill else 0,
         1 if follows else 0,
@@ -351,44 +370,36 @@ def _paper_steering(
 
 def _outputs(
     decided: supervisor.SupervisorState,
-    leg_state: manoeuvre.ManoeuvreState,
-    passed: last_gate.Passed,
+    leg: int,
+    angle_rad: float,
+    speed_mps: float,
+    brake_mps2: float,
+    follow: int,
     estimated: estimator.EstimatorState,
     wheelbase_m: float,
     standstill: bool,
 ) -> Outputs:
     """Return the frames' values. In Fault the vehicle stays enabled until it stands, to steer while braking."""
-    enable = 0
-    if (decided.mode == MODE_READY and decided.enabling != 0) or passed.follow != 0:
-        enable = 1
+    mode = decided.mode
+    enable = follow
     clear = 0
-    if decided.mode == MODE_MANUAL and decided.clearing_us > 0:
-        clear = 1
-    leg = leg_state.leg
-    if leg == LEG_IDLE and decided.reason == c.COMPLETE:
-        leg = LEG_COMPLETE
     gear = GEAR_NONE
-    if decided.mode == MODE_ACTIVE:
-        gear = manoeuvre.gear_of(leg_state.leg)
+    if mode == MODE_ACTIVE:
+        gear = manoeuvre.gear_of(leg)
+    elif mode == MODE_READY and decided.enabling != 0:
+        enable = 1
+    elif mode == MODE_MANUAL and decided.clearing_us > 0:
+        clear = 1
     park_brake = 0
-    if (passed.follow == 0 and standstill) or gear == GEAR_PARK:
+    if (follow == 0 and standstill) or gear == GEAR_PARK:
         park_brake = 1
+    reason = decided.reason
+    if leg == LEG_IDLE and reason == c.COMPLETE:
+        leg = LEG_COMPLETE
     return Outputs(
-        SysCommand(
-            enable,
-            clear,
-            decided.mode,
-            leg,
-            decided.reason,
-        ),
-        SteerCommand(passed.angle_rad, passed.follow),
-        LongCommand(
-            passed.speed_mps,
-            passed.brake_decel_mps2,
-            gear,
-            park_brake,
-            passed.follow,
-        ),
+        SysCommand(enable, clear, mode, leg, reason),
+        SteerCommand(angle_rad, follow),
+        LongCommand(speed_mps, brake_mps2, gear, park_brake, follow),
         Track(
             max(estimated.station_m, 0.0),
             estimated.cross_track_error_m,

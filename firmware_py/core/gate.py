@@ -5,31 +5,12 @@ follow at all. A value that is no number never passes and never stays.
 """
 
 import math
-from typing import NamedTuple
 
 from firmware_py.core.bounds import bounded
 from firmware_py.core.signals import MODE_ACTIVE, MODE_FAULT
 from firmware_py.core.speed import HOLD_DECEL_MPS2
 from firmware_py.core.supervisor import STOP_EMERGENCY
 from firmware_py.core.tables import CarTable
-
-
-class Wanted(NamedTuple):
-    """What the law wants: road-wheel angle (left positive), travel speed (never negative), brake."""
-
-    angle_rad: float
-    travel_speed_mps: float
-    brake_decel_mps2: float
-
-
-class Passed(NamedTuple):
-    """What may be sent, and the rounding remainder of the angle that the next command makes good."""
-
-    angle_rad: float
-    angle_carry_rad: float
-    speed_mps: float
-    brake_decel_mps2: float
-    follow: int
 
 
 def is_number(value: float) -> bool:
@@ -44,22 +25,24 @@ def gate(
     reaction: int,
     released: int,
     sigma: float,
-    wanted: Wanted,
+    angle_rad: float,
+    speed_mps: float,
+    brake_mps2: float,
     previous_rad: float,
     carry_rad: float,
     period_s: float,
-) -> Passed:
-    """Return the commands that may leave the controller.
+) -> tuple[float, float, float, float, int]:
+    """Return what may leave the controller: angle, its carry, signed speed, brake, and whether to follow it (1 or 0).
+
+    Wanted are a road-wheel angle (left positive), a travel speed (never negative) and a brake. The carry is the angle's
+    rounding remainder, which the next command makes good.
 
     Active: the wanted commands, bounded. Fault: steering goes on to follow the path while the brake stops the car,
     until it has stood or the driver has taken over (`released`). Otherwise nothing is to be followed: brake held, no
     speed.
     """
-    angle_rad = wanted.angle_rad
     if not is_number(angle_rad):
         angle_rad = previous_rad
-    speed_mps = wanted.travel_speed_mps
-    brake_mps2 = wanted.brake_decel_mps2
     if not is_number(speed_mps) or not is_number(brake_mps2):
         speed_mps = 0.0
         brake_mps2 = car.controlled_decel_mps2
@@ -95,10 +78,4 @@ def gate(
     angle_rad = bounded(angle_rad, -most_rad, most_rad)
     sent_rad = math.floor(angle_rad / lsb_rad + 0.5) * lsb_rad
     remainder_rad = bounded(angle_rad - sent_rad, -lsb_rad, lsb_rad)
-    return Passed(
-        sent_rad,
-        remainder_rad,
-        sigma * speed_mps,
-        brake_mps2,
-        follow,
-    )
+    return sent_rad, remainder_rad, sigma * speed_mps, brake_mps2, follow

@@ -7,6 +7,8 @@ controller that was late itself does not take its peers for silent; its own late
 from typing import NamedTuple
 
 from firmware_py.core import conditions as c
+from firmware_py.core.estimator import EstimatorState
+from firmware_py.core.path import plan_at
 from firmware_py.core.signals import (
     MODE_ACTIVE,
     MODE_FAULT,
@@ -15,7 +17,7 @@ from firmware_py.core.signals import (
     QUALITY_FIXED,
     Inputs,
 )
-from firmware_py.core.tables import Tables
+from firmware_py.core.tables import LegTable, Tables
 
 PROTOCOL = 1
 """Version of the rules of the bus (CONVENTIONS.md) that the controller follows."""
@@ -99,23 +101,6 @@ class HealthState(NamedTuple):
     pose_is_new: int
 
 
-class Believed(NamedTuple):
-    """What the law believes of itself, for comparison with the reports."""
-
-    mode: int
-    direction_sigma: float
-    driving: int
-    stopping: int
-    planned_mps: float
-    beyond_end_m: float
-    cross_track_error_m: float
-    heading_error_rad: float
-    station_m: float
-    disbelieved: int
-    averaged: int
-    model_angle_rad: float
-
-
 def begin() -> HealthState:
     """Return the state before the first cycle: nothing was ever received."""
     never = Ages(
@@ -142,189 +127,183 @@ def begin() -> HealthState:
     )
 
 
-def _pose_is_new(inputs: Inputs) -> bool:
-    """Return whether a usable pose arrived: position and yaw of one sample (equal counters), both of full quality."""
-    return (
-        inputs.used.used_position_counter != NO_COUNTER
-        and inputs.used.used_position_counter == inputs.used.used_attitude_counter
-        and inputs.position.position_quality == QUALITY_FIXED
-        and inputs.attitude.yaw_quality == QUALITY_FIXED
-    )
+NEW = (0, False)
+"""Age of a report that this cycle brought, and that it is not lost."""
 
 
-def _age_us(age_us: int, is_new: bool, passed_us: int) -> int:
-    if is_new:
-        return 0
+def _older_us(age_us: int, passed_us: int) -> int:
+    """Return an age or a duration that goes on, held at NEVER_US."""
     age_us += passed_us
     if age_us > NEVER_US:
         age_us = NEVER_US
     return age_us
 
 
-def _older(ages: Ages, inputs: Inputs, pose_is_new: bool, passed_us: int) -> Ages:
-    """Return the ages one cycle later; a report that says itself that it is invalid ages on."""
-    used = inputs.used
-    steer_is_new = used.used_steer_counter != NO_COUNTER and inputs.steer.steer_angle_valid != 0
-    motion_is_new = used.used_motion_counter != NO_COUNTER and inputs.motion.speed_valid != 0
-    return Ages(
-        _age_us(ages.sys_us, used.used_sys_counter != NO_COUNTER, passed_us),
-        _age_us(ages.steer_us, steer_is_new, passed_us),
-        _age_us(ages.motion_us, motion_is_new, passed_us),
-        _age_us(ages.long_us, used.used_long_counter != NO_COUNTER, passed_us),
-        _age_us(ages.pose_us, pose_is_new, passed_us),
-        _age_us(ages.oper_us, used.used_oper_counter != NO_COUNTER, passed_us),
-        _age_us(ages.version_us, used.used_veh_version_counter != NO_COUNTER, passed_us),
-    )
-
-
-def _lasting_us(lasting_us: int, is_present: bool, passed_us: int) -> int:
-    if not is_present:
-        return 0
-    lasting_us += passed_us
-    if lasting_us > NEVER_US:
-        lasting_us = NEVER_US
-    return lasting_us
+def _older(age_us: int, passed_us: int, timeout_us: int) -> tuple[int, bool]:
+    """Return the age of a report that this cycle did not bring, and whether it is lost."""
+    age_us = _older_us(age_us, passed_us)
+    return age_us, age_us >= timeout_us
 
 
 def assess(
-    tables: Tables, state: HealthState, inputs: Inputs, believed: Believed, period_us: int
+    tables: Tables,
+    state: HealthState,
+    inputs: Inputs,
+    leg: LegTable,
+    mode: int,
+    driving: int,
+    stopping: int,
+    path: EstimatorState,
+    cross_track_error_m: float,
+    heading_error_rad: float,
+    period_us: int,
 ) -> tuple[HealthState, int]:
-    """Return the next state and the conditions present in this cycle (bits of `conditions`)."""
-    used = inputs.used
-    timeouts = tables.timeouts
-    car = tables.car
-    active = believed.mode == MODE_ACTIVE
-    moving_allowed = active and believed.driving != 0
-    speed_mps = inputs.motion.speed_meas_mps
+    """Return the next state and the conditions present in this cycle (bits of `conditions`).
 
-    overruns = used.overruns_before_cycle
+    `mode` to `heading_error_rad` are what the last cycle left: what the controller believes of itself and of the car's
+    place on the leg, for comparison with the reports.
+    """
+    _now_us, used, sys, steer, motion, long, position, attitude, oper, version, second_controller = inputs
+    timeouts = tables.timeouts
+    station_m = path.station_m
+    speed_mps = motion.speed_meas_mps
+    magnitude_mps = abs(speed_mps)
+    vehicle_state = sys.vehicle_state
+    active = mode == MODE_ACTIVE
+    moving_allowed = active and driving != 0
+    present = 0
+
+    # How old each report is: 0 with a new frame that does not say itself that it is invalid.
+    sys_n, steer_n, motion_n, long_n, position_n, attitude_n, oper_n, version_n, overruns = used
+    sys_us, steer_us, motion_us, long_us, pose_us, oper_us, version_us = state.ages
+    steer_is_new = steer_n != NO_COUNTER and steer.steer_angle_valid != 0
+    motion_is_new = motion_n != NO_COUNTER and motion.speed_valid != 0
+    # A pose is position and yaw of one sample (equal counters), both of full quality.
+    pose_poor = position.position_quality != QUALITY_FIXED or attitude.yaw_quality != QUALITY_FIXED
+    pose_is_new = position_n != NO_COUNTER and position_n == attitude_n and not pose_poor
+    sys_us, sys_lost = NEW if sys_n != NO_COUNTER else _older(sys_us, period_us, timeouts.sys_us)
+    steer_us, steer_lost = NEW if steer_is_new else _older(steer_us, period_us, timeouts.steer_us)
+    motion_us, motion_lost = NEW if motion_is_new else _older(motion_us, period_us, timeouts.motion_us)
+    long_us, long_lost = NEW if long_n != NO_COUNTER else _older(long_us, period_us, timeouts.long_us)
+    pose_us, pose_lost = NEW if pose_is_new else _older(pose_us, period_us, timeouts.pose_us)
+    oper_us, oper_lost = NEW if oper_n != NO_COUNTER else _older(oper_us, period_us, timeouts.oper_us)
+    version_us, version_lost = NEW if version_n != NO_COUNTER else _older(version_us, period_us, timeouts.version_us)
+    if sys_lost or steer_lost or motion_lost or long_lost or pose_lost or version_lost:
+        present |= 1 << c.WAITING_FOR_REPORTS
+        if sys_lost:
+            present |= 1 << c.SYS_REPORT_TIMEOUT
+        if steer_lost:
+            present |= 1 << c.STEER_REPORT_TIMEOUT
+        if motion_lost:
+            present |= 1 << c.MOTION_REPORT_TIMEOUT
+        if long_lost:
+            present |= 1 << c.LONG_REPORT_TIMEOUT
+        if pose_lost and pose_poor:
+            present |= 1 << c.POSE_INVALID
+        if pose_lost and not pose_poor:
+            present |= 1 << c.POSE_TIMEOUT
+    if oper_lost:
+        present |= 1 << c.WAITING_FOR_OPERATOR
+        present |= 1 << c.OPERATOR_TIMEOUT
+    if not version_lost:
+        if version.veh_dbc_hash != tables.dbc_hash24 or version.veh_protocol != PROTOCOL:
+            present |= 1 << c.DBC_HASH_MISMATCH
+        if version.veh_vehicle_hash != tables.vehicle_hash24:
+            present |= 1 << c.VEHICLE_HASH_MISMATCH
+
+    # What a driven car may not do for long.
+    steering_gap_us = 0
+    speed_gap_us = 0
+    wrong_direction_us = 0
+    rejected_us = 0
+    stuck_us = 0
+    if active:
+        travel_mps = leg.sigma * speed_mps
+        if abs(steer.road_wheel_angle_meas_rad - path.modelled_angle_rad) > STEERING_GAP_RAD:
+            steering_gap_us = _older_us(state.steering_gap_us, period_us)
+            if steering_gap_us >= STEERING_GAP_US:
+                present |= 1 << c.STEERING_NOT_FOLLOWING
+        if driving != 0:
+            planned_mps, _accel_mps2 = plan_at(leg, station_m)
+            if travel_mps > planned_mps + SPEED_GAP_MPS:
+                speed_gap_us = _older_us(state.speed_gap_us, period_us)
+            if stopping == 0 and magnitude_mps < STUCK_MPS:
+                stuck_us = _older_us(state.stuck_us, period_us)
+            if speed_gap_us >= SPEED_GAP_US or stuck_us >= STUCK_US:
+                present |= 1 << c.SPEED_NOT_FOLLOWING
+        if travel_mps < -WRONG_DIRECTION_MPS or (driving == 0 and magnitude_mps > ROLLING_MPS):
+            wrong_direction_us = _older_us(state.wrong_direction_us, period_us)
+            if wrong_direction_us >= WRONG_DIRECTION_US:
+                present |= 1 << c.WRONG_DIRECTION
+        if sys.sys_cmd_timeout != 0 or steer.steer_cmd_timeout != 0 or long.long_cmd_timeout != 0:
+            rejected_us = _older_us(state.rejected_us, period_us)
+            if rejected_us >= REJECTED_US:
+                present |= 1 << c.COMMAND_REJECTED
+
+    # Where the car is, and how fast.
+    away_m = abs(cross_track_error_m)
+    turned_rad = abs(heading_error_rad)
+    if not motion_lost and not long_lost and long.standstill != 0 and magnitude_mps < STANDSTILL_MPS:
+        present |= 1 << c.STANDSTILL
+    else:
+        present |= 1 << c.NOT_AT_STANDSTILL
+    if away_m > START_POSITION_M or abs(station_m) > START_POSITION_M or turned_rad > START_HEADING_RAD:
+        present |= 1 << c.POSE_NOT_AT_START
+    if away_m > OFF_PATH_M or turned_rad > OFF_PATH_HEADING_RAD:
+        present |= 1 << c.OFF_PATH
+    if moving_allowed and station_m - leg.length_m > BEYOND_END_M:
+        present |= 1 << c.OFF_PATH
+    if path.averaged < SETTLED_POSES:
+        present |= 1 << c.POSE_SETTLING
+    if path.disbelieved >= JUMPS_IN_A_ROW:
+        present |= 1 << c.POSE_JUMP
+    if magnitude_mps > OVER_SPEED_SHARE * tables.car.max_speed_mps + OVER_SPEED_MPS:
+        present |= 1 << c.OVER_SPEED
+
+    # What the vehicle says of itself, and who may interfere.
+    if vehicle_state != MODE_READY:
+        present |= 1 << c.VEHICLE_NOT_READY
+    if not sys_lost and vehicle_state == MODE_ACTIVE:
+        present |= 1 << c.VEHICLE_ACTIVE
+    if vehicle_state == MODE_FAULT or steer.steer_fault != 0 or long.long_fault != 0:
+        present |= 1 << c.VEHICLE_FAULT
+    if active and not sys_lost and vehicle_state != MODE_ACTIVE:
+        present |= 1 << c.VEHICLE_FAULT
+    if sys.driver_override != 0 or steer.steer_override != 0 or long.brake_override != 0:
+        present |= 1 << c.DRIVER_OVERRIDE
+    if second_controller != 0:
+        present |= 1 << c.SECOND_CONTROLLER
+    start, stop, emergency_stop, clear = oper
+    if stop != 0:
+        present |= 1 << c.OPERATOR_STOP
+    if emergency_stop != 0:
+        present |= 1 << c.EMERGENCY_STOP
+    # A press is an edge, seen while the operator is heard.
+    if start != 0 and state.start_was_pressed == 0 and not oper_lost:
+        present |= 1 << c.START_PRESSED
+    if clear != 0 and state.clear_was_pressed == 0 and not oper_lost:
+        present |= 1 << c.CLEAR_PRESSED
+
+    # Whether this controller keeps its own time.
     bucket = state.overrun_bucket + overruns
     leak = state.overrun_leak + 1
     if leak >= OVERRUN_LEAK_CYCLES:
         leak = 0
         if bucket > 0:
             bucket -= 1
-
-    rejecting = (
-        inputs.sys.sys_cmd_timeout != 0 or inputs.steer.steer_cmd_timeout != 0 or inputs.long.long_cmd_timeout != 0
-    )
-    pose_is_new = _pose_is_new(inputs)
-    ages = _older(state.ages, inputs, pose_is_new, period_us)
-    steering_gap = active and abs(inputs.steer.road_wheel_angle_meas_rad - believed.model_angle_rad) > STEERING_GAP_RAD
-    speed_gap = moving_allowed and speed_mps * believed.direction_sigma > believed.planned_mps + SPEED_GAP_MPS
-    stuck = moving_allowed and believed.stopping == 0 and abs(speed_mps) < STUCK_MPS
-    wrong_direction = active and (
-        speed_mps * believed.direction_sigma < -WRONG_DIRECTION_MPS
-        or (believed.driving == 0 and abs(speed_mps) > ROLLING_MPS)
-    )
-    pose_is_new_flag = 1 if pose_is_new else 0
+    if overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET:
+        present |= 1 << c.CYCLE_OVERRUN
     next_state = HealthState(
-        ages,
-        _lasting_us(state.steering_gap_us, steering_gap, period_us),
-        _lasting_us(state.speed_gap_us, speed_gap, period_us),
-        _lasting_us(state.wrong_direction_us, wrong_direction, period_us),
-        _lasting_us(state.rejected_us, active and rejecting, period_us),
+        Ages(sys_us, steer_us, motion_us, long_us, pose_us, oper_us, version_us),
+        steering_gap_us,
+        speed_gap_us,
+        wrong_direction_us,
+        rejected_us,
         bucket,
         leak,
-        _lasting_us(state.stuck_us, stuck, period_us),
-        inputs.oper.oper_start,
-        inputs.oper.oper_clear,
-        pose_is_new_flag,
+        stuck_us,
+        start,
+        clear,
+        1 if pose_is_new else 0,
     )
-
-    sys, steer, long, oper = inputs.sys, inputs.steer, inputs.long, inputs.oper
-    sys_lost = ages.sys_us >= timeouts.sys_us
-    steer_lost = ages.steer_us >= timeouts.steer_us
-    motion_lost = ages.motion_us >= timeouts.motion_us
-    long_lost = ages.long_us >= timeouts.long_us
-    pose_lost = ages.pose_us >= timeouts.pose_us
-    pose_poor = inputs.position.position_quality != QUALITY_FIXED or inputs.attitude.yaw_quality != QUALITY_FIXED
-    oper_lost = ages.oper_us >= timeouts.oper_us
-    version_lost = ages.version_us >= timeouts.version_us
-    standstill = not motion_lost and not long_lost and long.standstill != 0 and abs(speed_mps) < STANDSTILL_MPS
-    away_from_start = (
-        abs(believed.cross_track_error_m) > START_POSITION_M
-        or abs(believed.station_m) > START_POSITION_M
-        or abs(believed.heading_error_rad) > START_HEADING_RAD
-    )
-    off_path = (
-        abs(believed.cross_track_error_m) > OFF_PATH_M
-        or abs(believed.heading_error_rad) > OFF_PATH_HEADING_RAD
-        or (moving_allowed and believed.beyond_end_m > BEYOND_END_M)
-    )
-    over_speed = abs(speed_mps) > OVER_SPEED_SHARE * car.max_speed_mps + OVER_SPEED_MPS
-    overrun = overruns >= OVERRUNS_AT_ONCE or bucket > OVERRUN_BUCKET
-
-    present = 0
-    if sys_lost or steer_lost or motion_lost or long_lost or pose_lost or version_lost:
-        present |= 1 << c.WAITING_FOR_REPORTS
-    if oper_lost:
-        present |= 1 << c.WAITING_FOR_OPERATOR
-    if not version_lost and (
-        inputs.version.veh_dbc_hash != tables.dbc_hash24 or inputs.version.veh_protocol != PROTOCOL
-    ):
-        present |= 1 << c.DBC_HASH_MISMATCH
-    if not version_lost and inputs.version.veh_vehicle_hash != tables.vehicle_hash24:
-        present |= 1 << c.VEHICLE_HASH_MISMATCH
-    if away_from_start:
-        present |= 1 << c.POSE_NOT_AT_START
-    if believed.averaged < SETTLED_POSES:
-        present |= 1 << c.POSE_SETTLING
-    if not standstill:
-        present |= 1 << c.NOT_AT_STANDSTILL
-    if standstill:
-        present |= 1 << c.STANDSTILL
-    if sys.vehicle_state != MODE_READY:
-        present |= 1 << c.VEHICLE_NOT_READY
-    if not sys_lost and sys.vehicle_state == MODE_ACTIVE:
-        present |= 1 << c.VEHICLE_ACTIVE
-    if oper.oper_stop != 0:
-        present |= 1 << c.OPERATOR_STOP
-    if oper.oper_estop != 0:
-        present |= 1 << c.EMERGENCY_STOP
-    if sys.driver_override != 0 or steer.steer_override != 0 or long.brake_override != 0:
-        present |= 1 << c.DRIVER_OVERRIDE
-    if (
-        sys.vehicle_state == MODE_FAULT
-        or steer.steer_fault != 0
-        or long.long_fault != 0
-        or (active and not sys_lost and sys.vehicle_state != MODE_ACTIVE)
-    ):
-        present |= 1 << c.VEHICLE_FAULT
-    if sys_lost:
-        present |= 1 << c.SYS_REPORT_TIMEOUT
-    if steer_lost:
-        present |= 1 << c.STEER_REPORT_TIMEOUT
-    if motion_lost:
-        present |= 1 << c.MOTION_REPORT_TIMEOUT
-    if long_lost:
-        present |= 1 << c.LONG_REPORT_TIMEOUT
-    if pose_lost and not pose_poor:
-        present |= 1 << c.POSE_TIMEOUT
-    if oper_lost:
-        present |= 1 << c.OPERATOR_TIMEOUT
-    if pose_lost and pose_poor:
-        present |= 1 << c.POSE_INVALID
-    if believed.disbelieved >= JUMPS_IN_A_ROW:
-        present |= 1 << c.POSE_JUMP
-    if off_path:
-        present |= 1 << c.OFF_PATH
-    if over_speed:
-        present |= 1 << c.OVER_SPEED
-    if next_state.steering_gap_us >= STEERING_GAP_US:
-        present |= 1 << c.STEERING_NOT_FOLLOWING
-    if next_state.speed_gap_us >= SPEED_GAP_US or next_state.stuck_us >= STUCK_US:
-        present |= 1 << c.SPEED_NOT_FOLLOWING
-    if next_state.wrong_direction_us >= WRONG_DIRECTION_US:
-        present |= 1 << c.WRONG_DIRECTION
-    if overrun:
-        present |= 1 << c.CYCLE_OVERRUN
-    if next_state.rejected_us >= REJECTED_US:
-        present |= 1 << c.COMMAND_REJECTED
-    if inputs.second_controller != 0:
-        present |= 1 << c.SECOND_CONTROLLER
-    if oper.oper_start != 0 and state.start_was_pressed == 0 and not oper_lost:
-        present |= 1 << c.START_PRESSED
-    if oper.oper_clear != 0 and state.clear_was_pressed == 0 and not oper_lost:
-        present |= 1 << c.CLEAR_PRESSED
     return next_state, present

@@ -98,6 +98,11 @@ def proceed(
     )
 
 
+def keep(state: ManoeuvreState) -> ManoeuvreState:
+    """Return the next state in Fault: the leg stays, and nothing drives on it."""
+    return ManoeuvreState(state.leg, 0, 0, 0, 0)
+
+
 def is_done(state: ManoeuvreState, gear_rpt: int, park_brake_applied: int) -> bool:
     """Return whether the car is parked after the reverse leg."""
     return state.leg == LEG_COMPLETE and gear_rpt == GEAR_PARK and park_brake_applied != 0

@@ -52,6 +52,7 @@ def advance(
     with the mean angle of the interval, which is exact for the lag (table weight) and a good approximation under the
     rate limit.
     """
+    sigma = leg.sigma
     limit_rad = car.max_road_wheel_rate_radps * dt_s
     gap_rad = target_rad - angle_rad
     change_rad = bounded(car.lag_alpha * gap_rad, -limit_rad, limit_rad)
@@ -64,10 +65,10 @@ def advance(
     if radius_share < 0.5:
         radius_share = 0.5
     path_ds_m = ds_m * math.cos(heading_rad) / radius_share
-    heading_change_rad = leg.sigma * (curvature_1pm * ds_m - reference_1pm * path_ds_m)
+    heading_change_rad = sigma * (curvature_1pm * ds_m - reference_1pm * path_ds_m)
     return (
         station_m + path_ds_m,
-        cross_m + leg.sigma * math.sin(heading_rad + 0.5 * heading_change_rad) * ds_m,
+        cross_m + sigma * math.sin(heading_rad + 0.5 * heading_change_rad) * ds_m,
         heading_rad + heading_change_rad,
         angle_rad + change_rad,
     )

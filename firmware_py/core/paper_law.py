@@ -193,7 +193,7 @@ def step(
     nominal_rad = row.inverse_gain * (difference + state.inverse)
     inverse = row.inverse_pole * state.inverse + (row.inverse_pole - 1.0) * difference
     angle_rad += state.command_1 - nominal_rad
-    angle_rad = limit_angle(car, angle_rad, sent_rad, PERIOD_S).angle_rad
+    angle_rad, _ = limit_angle(car, angle_rad, sent_rad, PERIOD_S)
     command_1 = table.q_b1 * angle_rad - table.q_a1 * state.command_1 + state.command_2
     command_2 = table.q_b2 * angle_rad - table.q_a2 * state.command_1
     return Filters(integral_ms, y, 1, filtered_1, filtered_2, inverse, command_1, command_2), angle_rad

@@ -2,26 +2,27 @@
 
 import math
 
-from firmware_py.core.bounds import bounded
 from firmware_py.core.tables import LegTable
+
+TURN_RAD = 2.0 * math.pi
 
 
 def wrap_angle(angle_rad: float) -> float:
     """Return the angle in [-pi, pi)."""
-    return angle_rad - 2.0 * math.pi * math.floor((angle_rad + math.pi) / (2.0 * math.pi))
+    return angle_rad - TURN_RAD * math.floor((angle_rad + math.pi) / TURN_RAD)
 
 
 def _place(leg: LegTable, station_m: float) -> tuple[int, float, float]:
     """Return the row before a station, the share of the next row, and how far it is beyond the path's ends (m)."""
     beyond_m = 0.0
-    station = station_m
-    if station < 0.0:
-        beyond_m = station
-        station = 0.0
-    elif station > leg.length_m:
-        beyond_m = station - leg.length_m
-        station = leg.length_m
-    at = station / leg.step_m
+    length_m = leg.length_m
+    if station_m < 0.0:
+        beyond_m = station_m
+        station_m = 0.0
+    elif station_m > length_m:
+        beyond_m = station_m - length_m
+        station_m = length_m
+    at = station_m / leg.step_m
     row = math.floor(at)
     if row >= leg.last_row:
         row = leg.last_row - 1
@@ -37,9 +38,11 @@ def pose_at(leg: LegTable, station_m: float) -> tuple[float, float, float, float
     row, b, beyond_m = _place(leg, station_m)
     a = 1.0 - b
     n = row + 1
-    yaw_rad = a * leg.yaw_rad[row] + b * leg.yaw_rad[n]
-    x_m = a * leg.x_m[row] + b * leg.x_m[n]
-    y_m = a * leg.y_m[row] + b * leg.y_m[n]
+    xs_m, ys_m, yaws_rad = leg.x_m, leg.y_m, leg.yaw_rad
+    slips_rad, slips_1pm = leg.slip_heading_rad, leg.slip_curvature_1pm
+    x_m = a * xs_m[row] + b * xs_m[n]
+    y_m = a * ys_m[row] + b * ys_m[n]
+    yaw_rad = a * yaws_rad[row] + b * yaws_rad[n]
     if beyond_m != 0.0:
         travel_m = leg.sigma * beyond_m
         x_m += travel_m * math.cos(yaw_rad)
@@ -48,8 +51,8 @@ def pose_at(leg: LegTable, station_m: float) -> tuple[float, float, float, float
         x_m,
         y_m,
         yaw_rad,
-        a * leg.slip_heading_rad[row] + b * leg.slip_heading_rad[n],
-        a * leg.slip_curvature_1pm[row] + b * leg.slip_curvature_1pm[n],
+        a * slips_rad[row] + b * slips_rad[n],
+        a * slips_1pm[row] + b * slips_1pm[n],
     )
 
 
@@ -58,9 +61,10 @@ def feedforward_at(leg: LegTable, station_m: float) -> tuple[float, float]:
     row, b, _ = _place(leg, station_m)
     a = 1.0 - b
     n = row + 1
+    curvatures_1pm, slopes_1pm2 = leg.feedforward_curvature_1pm, leg.feedforward_slope_1pm2
     return (
-        a * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[n],
-        a * leg.feedforward_slope_1pm2[row] + b * leg.feedforward_slope_1pm2[n],
+        a * curvatures_1pm[row] + b * curvatures_1pm[n],
+        a * slopes_1pm2[row] + b * slopes_1pm2[n],
     )
 
 
@@ -69,17 +73,15 @@ def plan_at(leg: LegTable, station_m: float) -> tuple[float, float]:
     row, b, _ = _place(leg, station_m)
     a = 1.0 - b
     n = row + 1
+    speeds_mps, accels_mps2 = leg.speed_mps, leg.accel_mps2
     return (
-        a * leg.speed_mps[row] + b * leg.speed_mps[n],
-        a * leg.accel_mps2[row] + b * leg.accel_mps2[n],
+        a * speeds_mps[row] + b * speeds_mps[n],
+        a * accels_mps2[row] + b * accels_mps2[n],
     )
 
 
 def feedforward_curvature_1pm(leg: LegTable, station_m: float) -> float:
     """Return the feedforward curvature at a station, held beyond the ends: the one column of the model."""
-    station = bounded(station_m, 0.0, leg.length_m) / leg.step_m
-    row = math.floor(station)
-    if row >= leg.last_row:
-        row = leg.last_row - 1
-    b = station - row
-    return (1.0 - b) * leg.feedforward_curvature_1pm[row] + b * leg.feedforward_curvature_1pm[row + 1]
+    row, b, _ = _place(leg, station_m)
+    curvatures_1pm = leg.feedforward_curvature_1pm
+    return (1.0 - b) * curvatures_1pm[row] + b * curvatures_1pm[row + 1]

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-from firmware_py.core.bounds import bounded
 from firmware_py.core.tables import (
     KD,
     KI,
@@ -51,7 +50,7 @@ class Gains(NamedTuple):
 
 
 def gains_at(table: GainTable, direction: int, travel_speed_mps: float, with_yaw_rate: int) -> Gains:
-    """Return the gains for a direction index and a travel speed (never negative); held beyond the grid's ends."""
+    """Return the gains for a direction index and a travel speed; held beyond the grid's ends."""
     grid = table.speed_grid_mps
     # The first row whose upper end is not below the speed, by halving.
     row = 0
@@ -64,7 +63,10 @@ def gains_at(table: GainTable, direction: int, travel_speed_mps: float, with_yaw
             highest = middle
     low_mps = grid[row]
     b = (travel_speed_mps - low_mps) / (grid[row + 1] - low_mps)
-    b = bounded(b, 0.0, 1.0)
+    if b > 1.0:
+        b = 1.0
+    if b < 0.0:
+        b = 0.0
     a = 1.0 - b
     low = table.gain[direction][row]
     high = table.gain[direction][row + 1]

@@ -43,58 +43,39 @@ def begin(station_m: float) -> SpeedState:
     return SpeedState(reference_station_m=station_m, accel_mps2=0.0, stopping=0)
 
 
-class SpeedCommand(NamedTuple):
-    """Travel speed (never negative) and brake."""
-
-    travel_speed_mps: float
-    brake_decel_mps2: float
-
-
-def hold() -> SpeedCommand:
-    """Return the command that keeps the car at standstill."""
-    return SpeedCommand(0.0, HOLD_DECEL_MPS2)
-
-
 def follow(
     leg: LegTable, car: CarTable, state: SpeedState, station_now_m: float, travel_speed_mps: float, dt_s: float
-) -> tuple[SpeedState, SpeedCommand]:
-    """Return the next reference and the command that follows it.
+) -> tuple[SpeedState, float, float]:
+    """Return the next reference and the command that follows it: travel speed (never negative) and brake.
 
     The drive answers a speed command with a first-order lag, so the command leads the speed by lag times acceleration.
     Once the remaining distance is what the brake needs, the stop begins and is not taken back.
     """
-    remaining_m = leg.length_m - station_now_m
+    reference_m, last_mps2, stopping = state
+    length_m = leg.length_m
     speed_mps = travel_speed_mps
     if speed_mps < 0.0:
         speed_mps = 0.0
     braking_m = speed_mps * (car.brake_lag_s + 0.5 * dt_s) + 0.5 * speed_mps * speed_mps / STOP_DECEL_MPS2
-    if state.stopping != 0 or remaining_m <= braking_m:
-        return (
-            SpeedState(leg.length_m, 0.0, 1),
-            SpeedCommand(0.0, STOP_DECEL_MPS2),
-        )
-    planned_mps, planned_mps2 = plan_at(leg, state.reference_station_m)
-    station_m = state.reference_station_m + planned_mps * dt_s
-    if station_m > leg.length_m:
-        station_m = leg.length_m
-    if station_m > station_now_m + REFERENCE_LEAD_M:
-        station_m = station_now_m + REFERENCE_LEAD_M
-    wanted_mps = (
-        planned_mps + car.drive_lag_s * planned_mps2 + STATION_GAIN_1PS * (state.reference_station_m - station_now_m)
-    )
+    if stopping != 0 or length_m - station_now_m <= braking_m:
+        return SpeedState(length_m, 0.0, 1), 0.0, STOP_DECEL_MPS2
+    planned_mps, planned_mps2 = plan_at(leg, reference_m)
     lag_s = car.drive_lag_s
+    wanted_mps = planned_mps + lag_s * planned_mps2 + STATION_GAIN_1PS * (reference_m - station_now_m)
+    reference_m += planned_mps * dt_s
+    if reference_m > length_m:
+        reference_m = length_m
+    if reference_m > station_now_m + REFERENCE_LEAD_M:
+        reference_m = station_now_m + REFERENCE_LEAD_M
     if lag_s < LEAST_DRIVE_LAG_S:
         lag_s = LEAST_DRIVE_LAG_S
     eased_mps2 = JERK_LIMIT_MPS3 * dt_s
     accel_mps2 = (wanted_mps - speed_mps) / lag_s
-    accel_mps2 = bounded(accel_mps2, state.accel_mps2 - eased_mps2, state.accel_mps2 + eased_mps2)
+    accel_mps2 = bounded(accel_mps2, last_mps2 - eased_mps2, last_mps2 + eased_mps2)
     accel_mps2 = bounded(accel_mps2, -ACCEL_LIMIT_MPS2, ACCEL_LIMIT_MPS2)
     command_mps = bounded(speed_mps + lag_s * accel_mps2, CREEP_MPS, car.max_speed_mps)
     # What the clamps took away is not remembered: the next easing starts from what was asked for.
     commanded_mps2 = (command_mps - speed_mps) / lag_s
     if accel_mps2 > commanded_mps2:
         accel_mps2 = commanded_mps2
-    return (
-        SpeedState(station_m, accel_mps2, 0),
-        SpeedCommand(command_mps, 0.0),
-    )
+    return SpeedState(reference_m, accel_mps2, 0), command_mps, 0.0

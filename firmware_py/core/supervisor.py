@@ -149,7 +149,7 @@ def begin() -> SupervisorState:
 def find_transition(mode: int, conditions: int) -> int:
     """Return the row of TRANSITIONS that decides for a mode, or -1 where the mode stays."""
     if _ANY_REQUIRED[mode] != -1 and (conditions & _ANY_REQUIRED[mode]) == 0:
-        return -1  # nothing has happened: by far the most cycles, without a look at each row
+        return -1  # nothing has happened: no need to look at each row
     for row in range(_FIRST_ROW[mode], _END_ROW[mode]):
         if (conditions & TRANSITIONS[row][1]) == TRANSITIONS[row][1] and (conditions & TRANSITIONS[row][2]) == 0:
             return row
@@ -162,10 +162,11 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
     From Ready, a pressed start asks the vehicle to enable; Active begins when the vehicle reports Active. A start that
     the vehicle does not answer within ENABLE_TIMEOUT_US is withdrawn.
     """
-    enabling = state.enabling
-    enabling_us = state.enabling_us
+    if state.mode == MODE_ACTIVE and (conditions & _ANY_REQUIRED[MODE_ACTIVE]) == 0 and state.clearing_us == 0:
+        return state  # driving, and nothing has happened: by far the most cycles
+    mode, shown_reason, reaction, enabling, enabling_us, clearing_us, released, fault_us = state
     seen = conditions & ~(1 << c.START_PRESSED)
-    if state.mode == MODE_READY:
+    if mode == MODE_READY:
         if c.has(conditions, c.START_PRESSED):
             enabling = 1
             enabling_us = 0
@@ -176,25 +177,25 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
             seen |= 1 << c.START_PRESSED
             if enabling_us > ENABLE_TIMEOUT_US:
                 seen |= 1 << c.ENABLE_REFUSED
-    clearing_us = state.clearing_us - period_us
+    clearing_us -= period_us
     if clearing_us < 0:
         clearing_us = 0
-    if c.has(conditions, c.CLEAR_PRESSED) and state.mode != MODE_ACTIVE and c.has(conditions, c.STANDSTILL):
+    if mode != MODE_ACTIVE and c.has(conditions, c.CLEAR_PRESSED) and c.has(conditions, c.STANDSTILL):
         clearing_us = CLEAR_PULSE_US
 
-    row = find_transition(state.mode, seen)
+    row = find_transition(mode, seen)
     if row < 0:
-        reaction = _escalated(state, conditions)
-        fault_us = 0
-        released = 0
-        if state.mode == MODE_FAULT:
-            fault_us = min(state.fault_us + period_us, LONGEST_STOP_US)
-            released = state.released
+        if mode == MODE_FAULT:
+            reaction = _escalated(reaction, fault_us, conditions)
+            fault_us = min(fault_us + period_us, LONGEST_STOP_US)
             if c.has(conditions, c.STANDSTILL) or reaction == STOP_RELEASE or fault_us >= LONGEST_STOP_US:
                 released = 1
+        else:
+            fault_us = 0
+            released = 0
         return SupervisorState(
-            state.mode,
-            state.reason,
+            mode,
+            shown_reason,
             reaction,
             enabling,
             enabling_us,
@@ -202,34 +203,31 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
             released,
             fault_us,
         )
-    mode = TRANSITIONS[row][3]
-    reason = TRANSITIONS[row][4]
-    if mode not in (MODE_READY, MODE_ACTIVE):
+    _mode, _present, _absent, next_mode, reason, reaction = TRANSITIONS[row]
+    if next_mode not in (MODE_READY, MODE_ACTIVE):
         enabling = 0
         enabling_us = 0
-    if state.mode == MODE_MANUAL and mode == MODE_MANUAL:
-        reason = _manual_reason(state.reason, reason)
+    if mode == MODE_MANUAL and next_mode == MODE_MANUAL:
+        reason = _manual_reason(shown_reason, reason)
     return SupervisorState(
-        mode,
+        next_mode,
         reason,
-        TRANSITIONS[row][5],
+        reaction,
         enabling,
         enabling_us,
         clearing_us,
-        1 if TRANSITIONS[row][5] == STOP_RELEASE else 0,
+        1 if reaction == STOP_RELEASE else 0,
         0,
     )
 
 
-def _escalated(state: SupervisorState, conditions: int) -> int:
+def _escalated(reaction: int, fault_us: int, conditions: int) -> int:
     """Return the reaction of a standing fault: it may get harder, never softer; the first reason stays."""
-    if state.mode != MODE_FAULT:
-        return state.reaction
     if c.has(conditions, c.DRIVER_OVERRIDE):
         return STOP_RELEASE
-    if state.reaction == STOP_CONTROLLED and ((conditions & _EMERGENCIES) != 0 or state.fault_us >= CONTROLLED_STOP_US):
+    if reaction == STOP_CONTROLLED and ((conditions & _EMERGENCIES) != 0 or fault_us >= CONTROLLED_STOP_US):
         return STOP_EMERGENCY
-    return state.reaction
+    return reaction
 
 
 def _manual_reason(shown: int, blocking: int) -> int:

@@ -160,9 +160,10 @@ class Bench:
         self.notes.append(f"compiled and plain tick: the same bits in all {told['cycles']} recorded cycles")
         self.notes.append(f"tick and codec measured with {told['realtime']}")
         self.notes.append(
-            "tick_cold: the core's cycle as the loop runs it under SCHED_FIFO: rehearsed twice on the inputs of the "
-            "cycle before, then spun to its deadline. tick_unrehearsed: straight after its sleep, as is the compiled "
-            "floor of both: tick_cold is the loop's way against a compiled cycle without it"
+            "tick_cold: the core's cycle as the loop runs it under SCHED_FIFO: rehearsed on the inputs of the cycle "
+            "before, as often as it fits in before its deadline, in place of most of the spin. tick_unrehearsed: "
+            "straight after its sleep, as is the compiled floor of both: tick_cold is the loop's way against a "
+            "compiled cycle without it"
         )
 
     def _tick(self, worker: _Worker) -> None:

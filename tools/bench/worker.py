@@ -29,6 +29,9 @@ from tools.lockstep import DBC
 
 MESSAGE = "CTRL_SteerCmd"
 
+SETTLING_CYCLES = 100
+"""Cycles before the first sample in which the loop's pace finds out how long a rehearsal takes."""
+
 Samples = dict[str, list[int]]
 
 
@@ -63,13 +66,13 @@ class Ticks:
     def cold(self, samples: int, *, fifo: bool) -> Samples:
         """Return durations in ns, each sample after a sleep of its own to a multiple of 10 ms.
 
-        `looped`: the plain cycle as the loop runs it, which waits by the loop's own `Pace` and, where it has `fifo`,
-        rehearses on the inputs of the cycle before; `rehearsal` is what it rehearsed before each sample. `plain` and
-        `compiled` come straight from their sleep.
+        `looped`: the plain cycle as the loop runs it, which waits by the loop's own `Pace`, settled by then, and, where
+        it has `fifo`, rehearses on the inputs of the cycle before; `rehearsal` is what it rehearsed before each sample.
+        `plain` and `compiled` come straight from their sleep.
         """
         recording, entry, columns, output = self._recording, self._entry, self._columns, self._output
         step, tables, clock = controller.step, recording.tables, time.perf_counter_ns
-        durations: Samples = {"looped": [], "plain": [], "compiled": [], "rehearsal": []}
+        durations: Samples = {"looped": [], "plain": [], "compiled": [], "rehearsal": [0]}
         array = self._states[0].copy()
         cycle = recording.active[0]
 
@@ -80,6 +83,9 @@ class Ticks:
 
         sleeping = Pace(Clock())
         looping = Pace(Clock(), SPIN_NS, rehearse) if fifo else sleeping
+        for _ in range(SETTLING_CYCLES):
+            looping.wait_until(_next_deadline_ns())
+        durations["rehearsal"].clear()
         for cycle in _evenly(recording.active, samples):
             state, inputs, row = recording.states[cycle], recording.inputs[cycle], self._inputs[cycle]
             array[:] = self._states[cycle]

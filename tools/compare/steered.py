@@ -101,16 +101,18 @@ def _replaced(
         wanted_rad -= estimated.road_disturbance_rad + estimated.steering_offset_rad
         wanted_rad /= estimated.steering_gain
     last_rad = before.sent_angles_rad[0]
-    limited = limits.limit_angle(car, wanted_rad, last_rad, PERIOD_S)
+    wanted_rad, limited = limits.limit_angle(car, wanted_rad, last_rad, PERIOD_S)
     decided = after.supervisor
-    passed = last_gate.gate(
+    angle_rad, angle_carry_rad, _speed_mps, _brake_mps2, _follow = last_gate.gate(
         car,
         core.road_wheel_angle_lsb_rad,
         decided.mode,
         decided.reaction,
         decided.released,
         leg.sigma,
-        last_gate.Wanted(limited.angle_rad, 0.0, 0.0),
+        wanted_rad,
+        0.0,
+        0.0,
         last_rad,
         before.angle_carry_rad,
         PERIOD_S,
@@ -124,13 +126,13 @@ def _replaced(
         after.speed,
         after.integral_m2,
         after.paper,
-        limited.limited,
-        (passed.angle_rad, *before.sent_angles_rad[:-1]),
-        passed.angle_carry_rad,
+        limited,
+        (angle_rad, *before.sent_angles_rad[:-1]),
+        angle_carry_rad,
         after.speed_mps,
         after.standstill,
     )
-    steering = SteerCommand(passed.angle_rad, outputs.steer.steer_enable)
+    steering = SteerCommand(angle_rad, outputs.steer.steer_enable)
     return state, Outputs(outputs.sys, steering, outputs.long, outputs.track)
 
 
