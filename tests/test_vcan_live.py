@@ -340,7 +340,8 @@ def test_an_interrupt_reaches_the_command_and_nothing_is_left(tmp_path: Path) ->
     need_guest()
     script = (
         "import time\n"
-        "try:\n  print('up', flush=True)\n  time.sleep(60)\nexcept KeyboardInterrupt:\n  print('bye')\n  raise SystemExit(9)"
+        "try:\n  print('up', flush=True)\n  time.sleep(60)\n"
+        "except KeyboardInterrupt:\n  print('bye')\n  raise SystemExit(9)"
     )
     process = subprocess.Popen(
         [*PARKCTL, "guest", "--results", str(tmp_path), "--", sys.executable, "-c", script],
