@@ -149,6 +149,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     # Steering: feedforward + PID - disturbance, within the limits.
     feedforward_1pm, slope_1pm2 = feedforward_at(leg, station_m + travel_mps * MEAN_AGE_S)
     feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral_m2, gains, leg.sigma)
+    feedback_1pm = bounded(feedback_1pm, -pid.CORRECTION_MAX_1PM, pid.CORRECTION_MAX_1PM)
     wanted_rad = _steering(
         car,
         feedforward_1pm,
