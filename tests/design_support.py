@@ -75,12 +75,12 @@ class FirmwareLaw:
         _, e, heading, wheels_rad = predictor.predict(leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S)
         if not self.mode.predicts:
             e, heading = self.state.cross_track_error_m, self.state.heading_error_rad
-        feedback = pid.feedback_1pm(e, heading, self.integral_m2, self.gains, sigma)
+        preview = pid.preview_error_m(e, heading, self.gains.preview_m, sigma)
+        feedback = pid.feedback_1pm(preview, heading, self.integral_m2, self.gains, sigma)
         angle = math.atan(-car.wheelbase_m * feedback) - self.state.road_disturbance_rad
         if self.mode.predicts:
             angle += pid.push_rad(angle - wheels_rad, car)
         angle = (angle - self.state.steering_offset_rad) / self.state.steering_gain
-        preview = pid.preview_error_m(e, heading, self.gains.preview_m, sigma)
         self.integral_m2 = pid.integrate_m2(self.integral_m2, preview, ds_m, self.gains, 0)
         self.sent_rad = (angle, *self.sent_rad[:-1])
         return angle

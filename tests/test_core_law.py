@@ -107,32 +107,44 @@ def test_changing_one_row_of_one_direction_changes_nothing_else(column):
                 assert (abs(other - one) > 1e-9) == (inside and of_column == column)
 
 
+def command_beside_the_path_rad(used_tables, left_m):
+    """The command to a car that is about to drive forward, so far left of the path."""
+    state = controller.begin()
+    angle_rad = 0.0
+    for cycle in range(140):
+        inputs = standing_inputs(used_tables, cycle, s.MODE_READY if cycle < 61 else s.MODE_ACTIVE)
+        inputs = inputs._replace(
+            oper=inputs.oper._replace(oper_start=1 if cycle >= 60 else 0),
+            position=inputs.position._replace(position_y_m=left_m),
+            long=inputs.long._replace(gear_rpt=s.GEAR_DRIVE, park_brake_applied=0),
+            steer=inputs.steer._replace(road_wheel_angle_meas_rad=angle_rad),
+        )
+        state, outputs = controller.step(used_tables, state, inputs)
+        angle_rad = outputs.steer.road_wheel_angle_cmd_rad
+    assert outputs.sys.control_mode == s.MODE_ACTIVE
+    return angle_rad
+
+
 def test_the_controller_uses_the_row_of_its_direction():
     """A forward-only change of kp changes a forward command and leaves the reverse model untouched."""
     tables = shipped_tables()
     louder = tuple(tuple(3.0 * v if i == KP else v for i, v in enumerate(row)) for row in tables.gains.gain[FORWARD])
     forward_changed = tables._replace(gains=tables.gains._replace(gain=(louder, tables.gains.gain[REVERSE])))
     reverse_changed = tables._replace(gains=tables.gains._replace(gain=(tables.gains.gain[FORWARD], louder)))
+    command_rad = command_beside_the_path_rad(tables, 0.0015)
+    assert command_rad < -0.01, "left of the path, driving forward: steer to the right"
+    assert command_beside_the_path_rad(forward_changed, 0.0015) < 2.0 * command_rad
+    assert command_beside_the_path_rad(reverse_changed, 0.0015) == command_rad
 
-    def command(used_tables):
-        state = controller.begin()
-        angle_rad = 0.0
-        for cycle in range(140):
-            inputs = standing_inputs(used_tables, cycle, s.MODE_READY if cycle < 61 else s.MODE_ACTIVE)
-            inputs = inputs._replace(
-                oper=inputs.oper._replace(oper_start=1 if cycle >= 60 else 0),
-                position=inputs.position._replace(position_y_m=0.005),
-                long=inputs.long._replace(gear_rpt=s.GEAR_DRIVE, park_brake_applied=0),
-                steer=inputs.steer._replace(road_wheel_angle_meas_rad=angle_rad),
-            )
-            state, outputs = controller.step(used_tables, state, inputs)
-            angle_rad = outputs.steer.road_wheel_angle_cmd_rad
-        assert outputs.sys.control_mode == s.MODE_ACTIVE
-        return angle_rad
 
-    assert command(tables) < -0.01, "left of the path, driving forward: steer to the right"
-    assert command(forward_changed) < 2.0 * command(tables)
-    assert command(reverse_changed) == command(tables)
+def test_the_feedback_is_linear_near_the_path_and_bounded_far_from_it():
+    tables = shipped_tables()
+    near_rad, twice_rad, far_rad, farther_rad = (
+        command_beside_the_path_rad(tables, left_m) for left_m in (0.001, 0.002, 0.02, 0.05)
+    )
+    assert twice_rad == pytest.approx(2.0 * near_rad, rel=0.05)
+    most_rad = math.atan(tables.car.wheelbase_m * pid.CORRECTION_MAX_1PM)
+    assert far_rad == farther_rad == pytest.approx(-most_rad, abs=1e-3)
 
 
 def test_the_integral_stands_still_while_limited_and_stays_within_its_authority():
@@ -154,7 +166,7 @@ def test_the_push_makes_steerings_of_any_lag_as_much_faster(lag_s):
         angle_rad += step_s / lag_s * (0.01 - angle_rad)
         pushed_rad += step_s / lag_s * (0.01 + pid.push_rad(0.01 - pushed_rad, car) - pushed_rad)
     assert angle_rad == pytest.approx(0.01 * (1.0 - math.exp(-1.0)), rel=1e-2)
-    assert pushed_rad == pytest.approx(0.01 * (1.0 - math.exp(-1.5)), rel=1e-2)
+    assert pushed_rad == pytest.approx(0.01 * (1.0 - math.exp(-1.82)), rel=1e-2)
 
 
 def test_wheels_that_stand_as_wanted_and_a_steering_without_lag_get_no_push():
@@ -162,6 +174,22 @@ def test_wheels_that_stand_as_wanted_and_a_steering_without_lag_get_no_push():
     assert pid.push_rad(0.0, car) == 0.0
     assert pid.push_rad(0.01, car) > 0.0
     assert pid.push_rad(0.01, car._replace(lag_alpha=1.0)) == 0.0
+
+
+def test_the_push_is_what_the_nominal_actuator_would_still_lack_when_a_command_begins_to_act():
+    car = shipped_tables().car
+    for samples in (0, 1, 24):
+        left = math.exp(-(samples + 1) * controller.PERIOD_S / car.steering_lag_s)
+        assert pid.push_rad(-0.02, car._replace(command_latency_samples=samples)) == pytest.approx(-0.02 * left)
+
+
+@pytest.mark.parametrize("sigma", [1.0, -1.0])
+def test_a_car_far_off_comes_back_at_an_angle_of_about_one_and_a_half_degrees(sigma):
+    """At that angle the feedback changes its sign, however far off the car is."""
+    gains = gains_at(shipped_tables().gains, FORWARD, 1.0, 1)
+    for e_m in (0.03, 0.05, 0.5):
+        assert pid.feedback_1pm(e_m, -sigma * math.radians(1.0), 0.0, gains, sigma) > 0.0
+        assert pid.feedback_1pm(e_m, -sigma * math.radians(1.8), 0.0, gains, sigma) < 0.0
 
 
 def test_the_right_side_is_the_exact_mirror_of_the_left():

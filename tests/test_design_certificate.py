@@ -140,9 +140,9 @@ def certificate():
 def test_the_shipped_cars_are_certified(certificate):
     assert certificate.all_d_stable
     assert certificate.holds
-    assert certificate.min_disk_margin >= 0.80
+    assert certificate.min_disk_margin >= 0.75
     assert certificate.min_delay_margin_samples >= 15.0
-    assert certificate.min_gain_margin >= 7.0
+    assert certificate.min_gain_margin >= 5.5
     assert certificate.min_phase_margin_rad >= math.radians(43.0)
     for word in ("direction", "m/s", "lag 0.2 s", "1 samples", "steering gain", "mass 1.3", "stiffness 0.7"):
         assert word in certificate.worst

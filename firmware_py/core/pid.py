@@ -12,12 +12,15 @@ from firmware_py.core.tables import CarTable
 INTEGRAL_AUTHORITY_1PM = 0.02
 """Greatest curvature that the integral part may ask for: several times a steering bias, far below the car's."""
 
-ANGLE_GAIN = 0.55
-"""Share of what the wheels will lack of their wanted angle that is commanded on top of it."""
-
-CROSS_TRACK_MAX_M = 0.025
+CROSS_TRACK_MAX_M = 0.015
 """A car that is farther off comes back at the angle that this asks for: about 1.5 degrees. Between the cones of the box
 a steeper way back would swing the body's ends out."""
+
+CORRECTION_MAX_1PM = 0.025
+"""Greatest curvature by which the feedback corrects the feedforward: what a rack of 0.59 rad/s turns in a sixth of a
+second. A car that needs more angle than it has comes out of the sharpest bend centimetres off; with the whole of such
+gains its wheels would then go from side to side as fast as they can, always too late, and it would swing about the
+path to the end. Within millimetres of the path the bound is not reached."""
 
 
 def preview_error_m(cross_track_error_m: float, heading_error_rad: float, preview_m: float, sigma: float) -> float:
@@ -29,15 +32,9 @@ def preview_error_m(cross_track_error_m: float, heading_error_rad: float, previe
     return cross_m + sigma * preview_m * math.sin(heading_error_rad)
 
 
-def feedback_1pm(
-    cross_track_error_m: float, heading_error_rad: float, integral_m2: float, gains: Gains, sigma: float
-) -> float:
-    """Return the curvature to take away from the feedforward; positive when the car is left of the path."""
-    return (
-        gains.kp * preview_error_m(cross_track_error_m, heading_error_rad, gains.preview_m, sigma)
-        + sigma * gains.kd * math.sin(heading_error_rad)
-        + gains.ki * integral_m2
-    )
+def feedback_1pm(preview_m: float, heading_error_rad: float, integral_m2: float, gains: Gains, sigma: float) -> float:
+    """Return the curvature to take away from the feedforward, by the preview error; positive left of the path."""
+    return gains.kp * preview_m + sigma * gains.kd * math.sin(heading_error_rad) + gains.ki * integral_m2
 
 
 def integrate_m2(integral_m2: float, preview_m: float, ds_m: float, gains: Gains, limited: int) -> float:
@@ -51,8 +48,12 @@ def integrate_m2(integral_m2: float, preview_m: float, ds_m: float, gains: Gains
 def push_rad(lacking_rad: float, car: CarTable) -> float:
     """Return what to command on top of a wanted angle of which the wheels lack so much (rad).
 
-    The steering answers half as fast again, whatever its lag, which is worth more in phase than a faster PID. Twice as
-    much costs a third of the delay margin, and with a fast PID it reaches the rate limit at every turn of the command.
-    What the nominal actuator makes good within a cycle needs no push: one without lag gets none.
+    The steering answers 1.8 times as fast, whatever its lag, which is worth more in phase than a faster PID. What the
+    nominal actuator makes good before a command can act needs no push: one without lag gets none, and one with a long
+    dead time, where what the wheels will lack is mostly a guess, gets little.
     """
-    return ANGLE_GAIN * (1.0 - car.lag_alpha) * lacking_rad
+    kept = 1.0 - car.lag_alpha
+    push = kept * lacking_rad
+    for _ in range(car.command_latency_samples):
+        push *= kept
+    return push

@@ -147,5 +147,6 @@ def _shipped(tables: Tables, direction: int, seen: Seen) -> float:
         leg, car, estimated, state.sent_angles_rad, seen.travel_mps, PERIOD_S
     )
     feedforward_1pm, _slope = feedforward_at(leg, station_m)
-    correction_1pm = pid.feedback_1pm(cross_m, heading_rad, 0.0, gains, leg.sigma)
+    preview_m = pid.preview_error_m(cross_m, heading_rad, gains.preview_m, leg.sigma)
+    correction_1pm = pid.feedback_1pm(preview_m, heading_rad, 0.0, gains, leg.sigma)
     return math.atan(car.wheelbase_m * (feedforward_1pm - correction_1pm))

@@ -323,12 +323,12 @@ class _Cycle:
         _, cross_m, heading_rad, angle_rad = predictor.predict(leg, car, seen, queue, self.speed_mps, PERIOD_S)
         if not self.mode.predicts:
             cross_m, heading_rad = seen.cross_track_error_m, seen.heading_error_rad
-        feedback_1pm = pid.feedback_1pm(cross_m, heading_rad, integral, self.gains, sigma)
+        preview_m = pid.preview_error_m(cross_m, heading_rad, self.gains.preview_m, sigma)
+        feedback_1pm = pid.feedback_1pm(preview_m, heading_rad, integral, self.gains, sigma)
         wanted = math.atan(-car.wheelbase_m * feedback_1pm) - seen.road_disturbance_rad
         if self.mode.predicts:
             wanted += pid.push_rad(wanted - angle_rad, car)
         command = wanted - seen.steering_offset_rad
-        preview_m = pid.preview_error_m(cross_m, heading_rad, self.gains.preview_m, sigma)
         integral = pid.integrate_m2(integral, preview_m, ds_m, self.gains, 0)
         odometry_y, odometry_yaw = seen.odometry_y_m, seen.odometry_yaw_rad
         after = [
