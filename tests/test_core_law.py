@@ -188,8 +188,9 @@ def test_a_car_far_off_comes_back_at_an_angle_of_about_one_and_a_half_degrees(si
     """At that angle the feedback changes its sign, however far off the car is."""
     gains = gains_at(shipped_tables().gains, FORWARD, 1.0, 1)
     for e_m in (0.03, 0.05, 0.5):
-        assert pid.feedback_1pm(e_m, -sigma * math.radians(1.0), 0.0, gains, sigma) > 0.0
-        assert pid.feedback_1pm(e_m, -sigma * math.radians(1.8), 0.0, gains, sigma) < 0.0
+        for heading_rad, sign in ((math.radians(1.0), 1.0), (math.radians(1.8), -1.0)):
+            error_m = pid.preview_error_m(e_m, -sigma * heading_rad, gains.preview_m, sigma)
+            assert sign * pid.feedback_1pm(error_m, -sigma * heading_rad, 0.0, gains, sigma) > 0.0
 
 
 def test_the_right_side_is_the_exact_mirror_of_the_left():
