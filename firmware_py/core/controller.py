@@ -262,7 +262,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         integral_m2,
         paper,
         limited,
-        (sent_rad, *sent_angles_rad[:-1]),
+        (sent_rad,) + sent_angles_rad[:-1],  # noqa: RUF005
         angle_carry_rad,
         sigma * travel_mps,
         1 if standstill else 0,

@@ -234,9 +234,10 @@ def estimate(
         x_m += dx_m
         y_m += dy_m
         own_yaw_rad += turn_rad
-    odometry_x_m = (odometry_x_m[0] + dx_m, *odometry_x_m[:-1])
-    odometry_y_m = (odometry_y_m[0] + dy_m, *odometry_y_m[:-1])
-    odometry_yaw_rad = (odometry_yaw_rad[0] + turn_rad, *odometry_yaw_rad[:-1])
+    # Sums of tuples: (newest, *others) makes a list in between and takes half as long again.
+    odometry_x_m = (odometry_x_m[0] + dx_m,) + odometry_x_m[:-1]  # noqa: RUF005
+    odometry_y_m = (odometry_y_m[0] + dy_m,) + odometry_y_m[:-1]  # noqa: RUF005
+    odometry_yaw_rad = (odometry_yaw_rad[0] + turn_rad,) + odometry_yaw_rad[:-1]  # noqa: RUF005
     if yaw_rate_is_fresh != 0:
         last_yaw_rate_radps = yaw_rate_radps
     elif dt_s > 0.0:
