@@ -28,14 +28,17 @@ class EstimateFrames:
         self._standing += state.standstill
         if inputs.used.used_motion_counter != NO_COUNTER and inputs.motion.yaw_rate_valid != 0:
             self._with_yaw_rate += 1
-        if state.health.pose_is_new != 0 and state.estimator.disbelieved == 0:
-            self._poses += 1
-            self._position_sigma_m = inputs.attitude.position_sigma_m
-            pose = (inputs.position.position_x_m, inputs.position.position_y_m, inputs.attitude.yaw_rad)
-            if self._stood_at is not None:
-                dx_m, dy_m, turned_rad = (new - old for new, old in zip(pose, self._stood_at, strict=True))
+        stood_at, self._stood_at = self._stood_at, None
+        if state.health.pose_is_new == 0 or state.estimator.disbelieved != 0:
+            return
+        self._poses += 1
+        self._position_sigma_m = inputs.attitude.position_sigma_m
+        if state.standstill != 0 and state.estimator.averaged > 0:
+            self._stood_at = (inputs.position.position_x_m, inputs.position.position_y_m, inputs.attitude.yaw_rad)
+            # A pose with which a new average begins is another place, not noise.
+            if stood_at is not None and state.estimator.averaged > 1:
+                dx_m, dy_m, turned_rad = (new - old for new, old in zip(self._stood_at, stood_at, strict=True))
                 self._covariance = covariance.compare(self._covariance, dx_m, dy_m, turned_rad)
-            self._stood_at = pose if state.standstill != 0 else None
 
     def take(self, state: State) -> Estimate:
         """Return the frame's values at the end of the cycles since the last call."""

@@ -120,7 +120,9 @@ class Pace:
             self.rehearsal.add(now_ns - begun_ns)
             self.rehearsals += 1
             # A machine that is too slow for it, or was away, is left alone for some time.
-            took_ns = now_ns - begun_ns if now_ns <= deadline_ns else 2 * (REHEARSED_NS + self._spin_ns)
+            took_ns = now_ns - begun_ns
+            if now_ns > deadline_ns:
+                took_ns = max(took_ns, 2 * (REHEARSED_NS + self._spin_ns))
             longest_ns[again] = max(longest_ns[again], float(took_ns))
             again = 1
         return now_ns
@@ -155,7 +157,7 @@ class Loop:
         self._rates = rates
         punctual = realtime.fifo and self._clock.slow_motion == 1
         # A single CPU belongs to the others until the deadline.
-        rehearse = node.rehearse if rehearses and punctual and (os.cpu_count() or 1) > 1 else None
+        rehearse = node.rehearse if rehearses and punctual and len(os.sched_getaffinity(0)) > 1 else None
         self._pace = Pace(self._clock, SPIN_NS if punctual else 0, rehearse)
         self._realtime = realtime
         self._once = once

@@ -11,6 +11,7 @@ from firmware_py.core.signals import (
     MODE_FAULT,
     ControllerVersion,
     CycleStamp,
+    Estimate,
     Inputs,
     LongCommand,
     Outputs,
@@ -117,7 +118,6 @@ class ControllerNode:
         self.overruns += overruns
         self._cycle_index = (self._cycle_index + 1 + overruns) % CYCLE_INDEX_VALUES
         self.record.append(inputs, outputs)
-        self.estimate.add(self._state, inputs)
 
         pack = self._sender.pack
         out = [pack(name, values) for name, values in self._messages(inputs, outputs)]
@@ -127,8 +127,9 @@ class ControllerNode:
             out.append(pack("CTRL_HealthTiming", self.health.timing()))
         if self.cycles % self._every["CTRL_HealthCounts"] == 0:
             out.append(pack("CTRL_HealthCounts", self.health.counts(self.mailbox, self.overruns, send_failed)))
-        if self.cycles % self._every["CTRL_Estimate"] == 0:
-            out.append(pack("CTRL_Estimate", self.estimate.take(self._state)))
+        estimate = self._estimate(inputs)
+        if estimate is not None:
+            out.append(pack("CTRL_Estimate", estimate))
         self.frames_sent += len(out)
         return out
 
@@ -185,9 +186,26 @@ class ControllerNode:
         self._failed_cycles = 0
         return outputs
 
-    def _fail(self, error: Exception, inputs: Inputs) -> Outputs:
+    def _estimate(self, inputs: Inputs) -> Estimate | None:
+        """Carry on how sure the estimate is; what to send of it where that is due.
+
+        Nothing steers by it: a failure costs its frame.
+        """
+        if self._failed_cycles:
+            return None
+        try:
+            self.estimate.add(self._state, inputs)
+            return self.estimate.take(self._state) if self.cycles % self._every["CTRL_Estimate"] == 0 else None
+        except Exception as error:
+            self._note(error)
+            return None
+
+    def _note(self, error: Exception) -> None:
         if len(self.internal_errors) < 10:
             self.internal_errors.append(f"{type(error).__name__}: {error}")
+
+    def _fail(self, error: Exception, inputs: Inputs) -> Outputs:
+        self._note(error)
         self._failed_cycles += 1
         was = self._state.supervisor
         followed = self._outputs is not None and self._outputs.steer.steer_enable != 0

@@ -71,7 +71,7 @@ class Emulator:
         self._attitude: dict[str, Any] = {
             "yaw_quality": QUALITY_FIXED,
             "pose_latency_ms": 1.0e-6 * PERIOD_NS * nominal.pose_latency_samples,
-            "position_sigma_m": scenario.sensors.position_noise_m,
+            "position_sigma_m": scenario.sensors.stated_position_sigma_m,
         }
         self._received = tuple(self._wire.received[name] for name in WATCHED)
         self._faults = FaultInjector(scenario.faults, start_ns)

@@ -26,7 +26,7 @@ class Estimates(NamedTuple):
 def load_estimates(log: Path, dbc: Path, length_m: float) -> dict[str, Estimates]:
     """Read a bus log (`candump -L`); `length_m` is the path's. A leg of which it says nothing is left out.
 
-    Raises UserError for a log that cannot be read or is none.
+    What is no frame of ours is passed over. Raises UserError for a file that cannot be read.
     """
     database: Any = cantools.database.load_file(dbc)
     names = ("CTRL_SysCmd", "CTRL_Track", "CTRL_Estimate")
@@ -38,12 +38,12 @@ def load_estimates(log: Path, dbc: Path, length_m: float) -> dict[str, Estimates
         lines = log.read_text(encoding="ascii").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{log}: cannot be read: {getattr(error, 'strerror', None) or 'not a bus log'}") from None
-    for number, line in enumerate(lines, 1):
+    for line in lines:
         try:
             arbitration_id, _, data = line.rpartition(" ")[2].partition("#")
             frame_id, payload = int(arbitration_id, 16), bytes.fromhex(data)
         except ValueError:
-            raise UserError(f"{log}:{number}: must be (TIME) CHANNEL ID#DATA, as candump -L writes") from None
+            continue  # a remote frame, or the last line of a log that was cut off
         if len(payload) != FRAME_BYTES:
             continue  # a frame that no node of ours sent
         if frame_id == sys_cmd.frame_id:

@@ -211,8 +211,8 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     # Steering: feedforward + PID - disturbance, within the limits.
     feedforward_1pm, slope_1pm2 = feedforward_at(leg, station_m + travel_mps * MEAN_AGE_S)
     preview_m = pid.preview_error_m(cross_m, heading_rad, gains.preview_m, sigma)
-    feedback_1pm = pid.feedback_1pm(preview_m, heading_rad, integral_m2, gains, sigma)
-    feedback_1pm = bounded(feedback_1pm, -pid.CORRECTION_MAX_1PM, pid.CORRECTION_MAX_1PM)
+    asked_1pm = pid.feedback_1pm(preview_m, heading_rad, integral_m2, gains, sigma)
+    feedback_1pm = bounded(asked_1pm, -pid.CORRECTION_MAX_1PM, pid.CORRECTION_MAX_1PM)
     wanted_rad = _steering(
         car,
         feedforward_1pm,
@@ -230,7 +230,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
     if not follows:
         wanted_rad = angle_meas_rad
     wanted_rad, limited = limits.limit_angle(car, wanted_rad, last_rad, PERIOD_S)
-    held = 1 if limited != 0 or abs(cross_m) > pid.CROSS_TRACK_MAX_M else 0
+    held = 1 if limited != 0 or feedback_1pm != asked_1pm or abs(cross_m) > pid.CROSS_TRACK_MAX_M else 0
     integral_m2 = pid.integrate_m2(integral_m2, preview_m, travel_mps * dt_s, gains, held)
 
     # Speed, then the last word.

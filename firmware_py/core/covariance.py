@@ -1,11 +1,13 @@
 """How well the estimator knows where the car is: the covariance of its cross-track and heading error.
 
 Carried on by the same gains that the estimator uses, whatever they are (Joseph's form), so it is that of this filter
-and not of an ideal one. It knows two kinds of pose noise. What differs from one pose to the next averages out; how
-large it is, the poses of a car that stands show. The rest of the standard deviation that the localisation states for
-itself stays for seconds: no filter of poses sees it, and it is taken to be wholly in the estimate.
+and not of an ideal one; but for the gyro's bias and the road disturbance, whose small share is in the walk of the
+heading. It knows two kinds of pose noise. What differs from one pose to the next averages out; how large it is, the
+poses of a car that stands show. The rest of the standard deviation that the localisation states for itself stays for
+seconds: no filter of poses sees it, and it is taken to be wholly in the estimate.
 
-Nothing steers by it: it goes onto the bus ten times a second.
+Nothing steers by it: it goes onto the bus ten times a second. But two of the noises here (HEADING_WALK and
+YAW_RATE_NOISE_RADPS) are also what the estimator's gains are designed for: another number makes other tables.
 """
 
 import math
@@ -38,8 +40,11 @@ SEEN_SHARE = 0.7
 """Where the poses differ by so much of the variance that the localisation states, all of it averages out: the rest is
 within what some hundred pairs can tell."""
 
+UNKNOWN_SIGMA_M = 0.01
+"""Standard deviation of a position of which the localisation does not state any, as the estimator's gains assume."""
+
 UNSTATED_M = 0.0003
-"""What the localisation cannot state: its standard deviation comes in steps of 1 mm."""
+"""What the localisation cannot state, as its standard deviation comes in steps of 1 mm."""
 
 UNKNOWN_M = 1.0
 UNKNOWN_RAD = 0.1
@@ -142,8 +147,11 @@ def advance(state: CovarianceState, gains: Gains, interval: Interval) -> Covaria
 def deviations(state: CovarianceState, position_sigma_m: float) -> tuple[float, float]:
     """Return the standard deviations of cross-track (m) and heading error (rad) of the estimate.
 
-    `position_sigma_m` is what the localisation states for a position; what of it does not show from pose to pose stays.
+    `position_sigma_m` is what the localisation states for a position, 0 if it does not know; what of it does not show
+    from pose to pose stays.
     """
+    if position_sigma_m <= 0.0:
+        position_sigma_m = UNKNOWN_SIGMA_M
     stays_m2 = max(position_sigma_m * position_sigma_m - state.position_noise_m2 / SEEN_SHARE, UNSTATED_M * UNSTATED_M)
     yaw_sigma_rad = YAW_PER_POSITION_RADPM * position_sigma_m
     unstated_rad = YAW_PER_POSITION_RADPM * UNSTATED_M

@@ -26,8 +26,9 @@ NEVER_US = 60_000_000
 """Age of a report that was never received."""
 
 START_POSITION_M = 0.15
-START_HEADING_RAD = 0.10
-"""Greatest distance from the start pose at which the manoeuvre may begin: a third of the clearance to a cone."""
+START_HEADING_RAD = 0.04
+"""Greatest distance from the start pose at which the manoeuvre may begin: half the clearance to a cone. A car turned by
+so much goes 3 cm further aside before the law's bounded correction has turned it back."""
 
 OFF_PATH_M = 0.20
 OFF_PATH_HEADING_RAD = 0.25
@@ -153,7 +154,7 @@ def assess(
     mode: int,
     driving: int,
     stopping: int,
-    path: EstimatorState,
+    estimated: EstimatorState,
     cross_track_error_m: float,
     heading_error_rad: float,
     period_us: int,
@@ -165,7 +166,7 @@ def assess(
     """
     _now_us, used, sys, steer, motion, long, position, attitude, oper, version, second_controller = inputs
     timeouts = tables.timeouts
-    station_m = path.station_m
+    station_m = estimated.station_m
     speed_mps = motion.speed_meas_mps
     magnitude_mps = abs(speed_mps)
     vehicle_state = sys.vehicle_state
@@ -219,7 +220,7 @@ def assess(
     stuck_us = 0
     if active:
         travel_mps = leg.sigma * speed_mps
-        if abs(steer.road_wheel_angle_meas_rad - path.modelled_angle_rad) > STEERING_GAP_RAD:
+        if abs(steer.road_wheel_angle_meas_rad - estimated.modelled_angle_rad) > STEERING_GAP_RAD:
             steering_gap_us = _older_us(state.steering_gap_us, period_us)
             if steering_gap_us >= STEERING_GAP_US:
                 present |= 1 << c.STEERING_NOT_FOLLOWING
@@ -253,9 +254,9 @@ def assess(
         present |= 1 << c.OFF_PATH
     if moving_allowed and station_m - leg.length_m > BEYOND_END_M:
         present |= 1 << c.OFF_PATH
-    if path.averaged < SETTLED_POSES:
+    if estimated.averaged < SETTLED_POSES:
         present |= 1 << c.POSE_SETTLING
-    if path.disbelieved >= JUMPS_IN_A_ROW:
+    if estimated.disbelieved >= JUMPS_IN_A_ROW:
         present |= 1 << c.POSE_JUMP
     if magnitude_mps > OVER_SPEED_SHARE * tables.car.max_speed_mps + OVER_SPEED_MPS:
         present |= 1 << c.OVER_SPEED

@@ -163,7 +163,9 @@ def decide(state: SupervisorState, conditions: int, period_us: int) -> Superviso
     the vehicle does not answer within ENABLE_TIMEOUT_US is withdrawn.
     """
     if state.mode == MODE_ACTIVE and (conditions & _ANY_REQUIRED[MODE_ACTIVE]) == 0 and state.clearing_us == 0:
-        return state  # driving, and nothing has happened: by far the most cycles
+        # Driving, and nothing has happened: by far the most cycles. Active is entered without a reaction, not released
+        # and with no time in Fault: nothing of them is left to count.
+        return state
     mode, shown_reason, reaction, enabling, enabling_us, clearing_us, released, fault_us = state
     seen = conditions & ~(1 << c.START_PRESSED)
     if mode == MODE_READY:

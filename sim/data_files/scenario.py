@@ -81,6 +81,10 @@ class PlantDeviation(BaseModel):
     corners: dict[str, Annotated[float, Field(ge=0.0, le=0.9, allow_inf_nan=False)]] = {}
 
 
+LEAST_STATED_SIGMA_M = 0.001
+"""One step of the signal position_sigma_m."""
+
+
 class Sensors(BaseModel):
     """Errors of the sensors.
 
@@ -102,6 +106,11 @@ class Sensors(BaseModel):
     odometry_scale: Annotated[_AnyDraw, AfterValidator(_within(-0.2, 0.2))] = (0.0, 0.0)
     gyro_noise_radps: Annotated[float, Field(ge=0.0, le=0.2, allow_inf_nan=False)] = 0.0
     gyro_bias_walk_radps_per_root_s: Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False)] = 0.0
+
+    @property
+    def stated_position_sigma_m(self) -> float:
+        """What the localisation states of itself: at least the bus's step of it, as 0 would be "not known"."""
+        return max(self.position_noise_m, LEAST_STATED_SIGMA_M)
 
 
 class StartOffset(BaseModel):

@@ -65,7 +65,7 @@ def begin(
         yardstick=Yardstick(outline_of(nominal), course.cones_xy(side), course.cone_radius_m),
         start_ns=0,
         pose_latency_ms=wire.report(1.0e-6 * plant.PERIOD_NS * nominal.pose_latency_samples, scales.pose_latency_ms),
-        position_sigma_m=wire.report(scenario.sensors.position_noise_m, scales.position_sigma_m),
+        position_sigma_m=wire.report(scenario.sensors.stated_position_sigma_m, scales.position_sigma_m),
     )
     memory = plant.begin_memory(0)
     motion = plant.begin(setup.car, memory, setup.start, 0)

@@ -98,9 +98,9 @@ GAIN_SPREAD = 0.1
 def pid_gains(pace: float) -> tuple[float, float, float]:
     """PID gains kp (1/m^2), ki (1/m^3), kd (1/m) whose poles per metre are those of (3, 0.8, 2.7) times the pace.
 
-    Up to the pace at which kd comes to its greatest; a higher one makes the error smaller, and less damped.
-    With the preview at full speed the two poles of the error fall together: what pushes the car aside while it points
-    along the path, as the slip of the rear tyres does, leaves an error of kd / kp times its angle.
+    Up to the pace at which kd comes to its greatest the two poles of the error, with the preview at full speed, fall
+    together; a higher one makes the error smaller, and less damped. What pushes the car aside while it points along
+    the path, as the slip of the rear tyres does, leaves an error of kd / kp times its angle.
     """
     return 3.0 * pace**2, 0.8 * pace**3, min(2.7 * pace, KD_MAX_1PM)
 
