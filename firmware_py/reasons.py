@@ -8,7 +8,7 @@ TEXT = {
     c.WAITING_FOR_OPERATOR: "waiting for the operator station's heartbeat: run `parkctl operate`",
     c.DBC_HASH_MISMATCH: "the vehicle was built for another parking.dbc or protocol",
     c.VEHICLE_HASH_MISMATCH: "the tables are for other vehicle parameters than the vehicle has: run `parkctl design`",
-    c.POSE_NOT_AT_START: "the car does not stand at the start pose (within 0.15 m and 0.04 rad)",
+    c.POSE_NOT_AT_START: "the car does not stand at the start pose (within 0.10 m and 0.025 rad)",
     c.NOT_AT_STANDSTILL: "the car is not at standstill",
     c.VEHICLE_NOT_READY: "the vehicle does not report Ready",
     c.ENABLE_REFUSED: "the vehicle did not become Active within 1 s of the request",

@@ -89,7 +89,7 @@ def test_a_right_car_passes_every_line() -> None:
     assert checks["VEH_SteerRpt"].text == "every 10.00 ms, jitter p99 0.00 ms, longest silence 10.0 ms"
     assert checks["OPER_Cmd"].text.startswith("every 20.00 ms")
     # 6 reports at 100 Hz, one at 50, one at 10: 660 frames of at most 135 bits; the controller adds 612.
-    assert checks["bus load"].text == "18% now, 34% with the controller's frames, at 500000 bit/s"
+    assert checks["bus load"].text == "18% now, 35% with the controller's frames, at 500000 bit/s"
 
 
 def test_the_nominal_bit_rate_is_the_dbcs() -> None:

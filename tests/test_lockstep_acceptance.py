@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from core_support import TABLES
 
+from firmware_py.core.health import START_HEADING_RAD, START_POSITION_M
 from sim.body import clearance_array_m, outline_of
-from sim.data_files import load_course, load_scenario, load_vehicle
+from sim.data_files import StartOffset, load_course, load_scenario, load_vehicle
 from tools.design.tables import design_tables
 from tools.figures import leg_figures, load_path, split_legs, truth_of_rows
 from tools.lockstep import run_lockstep
@@ -137,3 +138,24 @@ def test_the_law_without_observer_drives_the_test_too_and_is_worse_in_noise(tabl
         for run in (plain, observed)
     ]
     assert rms_m[1] < rms_m[0] < 0.02
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "heading_rad"), [(a, h) for a in (0.095, -0.095) for h in (0.0235, -0.0235)] + [(0.0, 0.0235)]
+)
+def test_from_every_corner_of_the_start_window_no_cone_is_touched(aside_m, heading_rad):
+    """A little within it, as the controller measures with noise; beside them it does not start."""
+    start = StartOffset(aside_m=(aside_m, aside_m), heading_rad=(heading_rad, heading_rad))
+    assert abs(aside_m) < START_POSITION_M
+    assert abs(heading_rad) < START_HEADING_RAD
+    scenario = load_scenario("car").model_copy(update={"start": start})
+    run = run_lockstep(load_vehicle("paper"), load_course("ohio"), scenario, "left", 1, "car", TABLES)
+    assert run.controller["completed"], run.controller["reason_text"]
+    assert run.exam.cones_touched == ()
+    beyond = StartOffset(heading_rad=(1.2 * START_HEADING_RAD,) * 2)
+    if aside_m == 0.0:
+        scenario = scenario.model_copy(update={"start": beyond})
+        refused = run_lockstep(
+            load_vehicle("paper"), load_course("ohio"), scenario, "left", 1, "car", TABLES, longest_s=5.0
+        )
+        assert "does not stand at the start pose" in refused.controller["reason_text"]

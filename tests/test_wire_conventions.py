@@ -215,7 +215,7 @@ def test_the_limits_are_those_of_the_controller() -> None:
 
 def test_the_other_figures_are_those_of_the_controller() -> None:
     flat = " ".join(TEXT.split())
-    arming = f"within {health.START_POSITION_M:.2f} m and {health.START_HEADING_RAD:.2f} rad of the start pose"
+    arming = f"within {health.START_POSITION_M:.2f} m and {health.START_HEADING_RAD:.3f} rad of the start pose"
     assert arming in flat
     assert f"speed below {health.STANDSTILL_MPS:g} m/s" in flat
     assert f"averages {health.SETTLED_POSES} poses at standstill" in flat

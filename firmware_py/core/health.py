@@ -25,10 +25,11 @@ PROTOCOL = 1
 NEVER_US = 60_000_000
 """Age of a report that was never received."""
 
-START_POSITION_M = 0.15
-START_HEADING_RAD = 0.04
-"""Greatest distance from the start pose at which the manoeuvre may begin: half the clearance to a cone. A car turned by
-so much goes 3 cm further aside before the law's bounded correction has turned it back."""
+START_POSITION_M = 0.10
+START_HEADING_RAD = 0.025
+"""Greatest distance from the start pose at which the manoeuvre may begin. Both at once bring the front corner of a car
+whose front is 5 m ahead of the rear axle 0.23 m nearer to a cone of the box, and the bounded correction lets it go on
+aside for 1 cm more: less than the clearance."""
 
 OFF_PATH_M = 0.20
 OFF_PATH_HEADING_RAD = 0.25
