@@ -119,11 +119,13 @@ class Pace:
             begun_ns, now_ns = now_ns, self._clock.now_ns()
             self.rehearsal.add(now_ns - begun_ns)
             self.rehearsals += 1
-            # A machine that is too slow for it, or was away, is left alone for some time.
-            took_ns = now_ns - begun_ns
+            took_ns = float(now_ns - begun_ns)
             if now_ns > deadline_ns:
-                took_ns = max(took_ns, 2 * (REHEARSED_NS + self._spin_ns))
-            longest_ns[again] = max(longest_ns[again], float(took_ns))
+                # A machine that is too slow for it is left alone for some time; one that was away during a later one,
+                # which takes less than the first, for a short time only.
+                known_late_ns = 2.0 * (REHEARSED_NS + self._spin_ns)
+                took_ns = known_late_ns if again else max(took_ns, known_late_ns)
+            longest_ns[again] = max(longest_ns[again], took_ns)
             again = 1
         return now_ns
 
