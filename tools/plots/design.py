@@ -81,7 +81,9 @@ def design_sheet(
     _margins(figure.add_subplot(grid[1, 2]), margins, "disk", "disk margin, worst car of the box")
     axes = figure.add_subplot(grid[2, 2])
     _margins(axes, margins, "delay_samples", "delay margin (samples), worst car of the box")
+    least = min((value for entry in margins for value in entry["delay_samples"]), default=1.0)
     axes.set_yscale("log")  # it falls with the speed
+    axes.set_ylim(bottom=0.5 * least)
     axes = figure.add_subplot(grid[3, 2])
     axes.axis("off")
     axes.text(0.0, 1.0, "\n".join(facts), va="top", family="monospace", fontsize=9, transform=axes.transAxes)
@@ -146,7 +148,7 @@ def _margins(axes: Axes, margins: Sequence[Mapping[str, Any]], key: str, label: 
     axes.set_ylim(bottom=0.0)
     axes.grid(visible=True, alpha=0.3)
     if margins:
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, loc="center right")
 
 
 def trade(file: Path, *, points: Sequence[Mapping[str, Any]], title: str) -> None:
