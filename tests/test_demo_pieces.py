@@ -15,6 +15,7 @@ import can
 import pytest
 from rich.console import Console
 
+from firmware_py.core.conditions import COMPLETE
 from sim.can_side import CanSide
 from sim.data_files import load_course, load_vehicle
 from sim.errors import UserError
@@ -360,6 +361,17 @@ def test_start_is_pressed_for_a_moment_each_time_the_controller_becomes_ready_un
         station.press_start_when_ready(t * MS)
         pressed.append(station.start)
     assert pressed == [False, True, True, False, False, True, False, False, False, False]
+
+
+def test_a_completed_manoeuvre_is_counted_however_soon_the_controller_is_ready_again() -> None:
+    """All frames of a busy moment are heard before anybody looks at the mode."""
+    station, controller = Station(DBC), CanSide(DBC, nodes=("CTRL",))
+    for t, mode, reason in [(0, 0, COMPLETE), (10, 1, 0), (20, 2, 0), (30, 0, COMPLETE), (40, 0, COMPLETE), (50, 1, 0)]:
+        hear(station, controller, t * MS, mode, reason=reason)
+    assert (station.mode, station.completions) == ("Ready", 1)
+    for t, mode, reason in [(60, 2, 0), (70, 3, 9), (80, 0, 0)]:  # one that was stopped is none
+        hear(station, controller, t * MS, mode, reason=reason)
+    assert station.completions == 1
 
 
 def test_a_frame_with_a_wrong_crc_says_nothing_to_the_station() -> None:

@@ -92,6 +92,8 @@ class Station:
         self._due_ns = 0
         self._ready_ns = 0
         self._has_driven = False
+        self.completions = 0
+        """How often a manoeuvre was completed: the controller may be Ready again before one looks."""
 
     def heartbeat(self, now_ns: int) -> tuple[int, bytes] | None:
         """Return the frame that is due now, or None; skipped periods are not made up for."""
@@ -112,7 +114,10 @@ class Station:
             name, values = decoded
             self.heard_ns[name] = now_ns
             if values:
+                was_active = name == "CTRL_SysCmd" and self.mode == ACTIVE
                 self.values[name] = values
+                if was_active and self.mode == MANUAL and self.reason == COMPLETE:
+                    self.completions += 1
 
     def is_silent(self, name: str, now_ns: int) -> bool:
         """Whether no valid frame of the message has come for its timeout."""

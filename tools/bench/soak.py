@@ -199,7 +199,7 @@ class SoakRun(LiveRun):
                 blocked_s = (blocked_s or now_s) if blocked else None
                 if now_s - waiting_s > START_LIMIT_S or now_s - (blocked_s or now_s) > BLOCKED_LIMIT_S:
                     return f"test {len(self.tests) + 1}: the car did not start: {station.reason_text}"
-            elif station.mode == MANUAL and station.reason == COMPLETE:
+            elif station.completions > len(self.tests):
                 said = self._controller.latest
                 test = Drive(
                     number=len(self.tests) + 1,
