@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from firmware_py.codec import Codec, Mailbox, Sender
 from firmware_py.core import conditions as c
-from firmware_py.core import controller
+from firmware_py.core import controller, kalman
 from firmware_py.core.health import PROTOCOL
 from firmware_py.core.signals import (
     MODE_ACTIVE,
@@ -21,7 +21,6 @@ from firmware_py.core.signals import (
 )
 from firmware_py.core.supervisor import STOP_EMERGENCY, STOP_RELEASE, SupervisorState
 from firmware_py.core.tables import Tables, Timeouts
-from firmware_py.estimate_frames import EstimateFrames
 from firmware_py.health_frames import HealthFrames
 from firmware_py.record import FlightRecord
 from firmware_py.table_file import TableSet
@@ -81,7 +80,6 @@ class ControllerNode:
         self.mailbox = Mailbox(codec)
         self.record = FlightRecord()
         self.health = HealthFrames()
-        self.estimate = EstimateFrames(tables)
         self.stop_requested = False
         self.cycles = 0
         self.overruns = 0
@@ -127,9 +125,8 @@ class ControllerNode:
             out.append(pack("CTRL_HealthTiming", self.health.timing()))
         if self.cycles % self._every["CTRL_HealthCounts"] == 0:
             out.append(pack("CTRL_HealthCounts", self.health.counts(self.mailbox, self.overruns, send_failed)))
-        estimate = self._estimate(inputs)
-        if estimate is not None:
-            out.append(pack("CTRL_Estimate", estimate))
+        if self.cycles % self._every["CTRL_Estimate"] == 0 and not self._failed_cycles:
+            out.append(pack("CTRL_Estimate", self._estimate(inputs)))
         self.frames_sent += len(out)
         return out
 
@@ -186,19 +183,11 @@ class ControllerNode:
         self._failed_cycles = 0
         return outputs
 
-    def _estimate(self, inputs: Inputs) -> Estimate | None:
-        """Carry on how sure the estimate is; what to send of it where that is due.
-
-        Nothing steers by it: a failure costs its frame.
-        """
-        if self._failed_cycles:
-            return None
-        try:
-            self.estimate.add(self._state, inputs)
-            return self.estimate.take(self._state) if self.cycles % self._every["CTRL_Estimate"] == 0 else None
-        except Exception as error:
-            self._note(error)
-            return None
+    def _estimate(self, inputs: Inputs) -> Estimate:
+        """Return how sure the estimator is, and what it has learnt of the car."""
+        seen = self._state.estimator
+        cross_m, heading_rad = kalman.deviations(seen.filter.covariance, inputs.attitude.position_sigma_m)
+        return Estimate(cross_m, heading_rad, seen.steering_gain, seen.steering_offset_rad, seen.odometry_scale)
 
     def _note(self, error: Exception) -> None:
         if len(self.internal_errors) < 10:

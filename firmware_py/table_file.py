@@ -27,7 +27,7 @@ from firmware_py.core.tables import (
 from firmware_py.errors import UserError
 from firmware_py.feedforward import slip_feedforward
 
-FORMAT = 1
+FORMAT = 2
 REMEDY = "run `parkctl design --update`"
 
 PATH_COLUMNS = ("station_m", "x_m", "y_m", "yaw_rad", "curvature_1pm", "curvature_slope_1pm2")
@@ -40,19 +40,10 @@ GAINS_COLUMNS = (
     "ki",
     "kd",
     "l_o",
-    "l_ee",
-    "l_ep",
-    "l_pe",
-    "l_pp",
-    "l_be",
-    "l_bp",
     "l_dr",
-    "m_ee",
-    "m_ep",
-    "m_pe",
-    "m_pp",
-    "m_de",
-    "m_dp",
+    "w_e",
+    "w_p",
+    "w_d",
 )
 PAPER_COLUMNS = (
     "direction",
@@ -69,8 +60,8 @@ PAPER_COLUMNS = (
     "q_a2",
 )
 LAWS = {"car": LAW_CAR, "pid+ff": LAW_PLAIN, "paper": LAW_PAPER, "dob": LAW_PAPER, "pid": LAW_PAPER}
-"""The laws by name. A law without observer has one in its table that takes each pose as it comes (l_ee = l_pp = m_ee =
-m_pp = 1, the rest 0); the paper's laws have that one beside their own table: `paper` both parts, `dob`, `pid` one."""
+"""The laws by name. All but `car` take each pose as it comes, and their estimator learns nothing of the car (l_o to w_d
+are 0); the paper's laws have the gains of `pid+ff` beside their own table: `paper` both parts, `dob`, `pid` one."""
 
 NO_PAPER = PaperTable((0.0, 1.0), 1, (((0.0,) * 6,) * 2,) * 2, 0.0, 0.0, 0.0, 0.0, 0, 0)
 NO_REFERENCE = ReferencePath(0.0, *[((0.0, 0.0),) * 2] * 3)

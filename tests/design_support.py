@@ -9,6 +9,8 @@ from firmware_py.core.schedule import gains_at
 from firmware_py.core.tables import GainTable
 from sim.data_files import load_scenario, load_vehicle
 from tools.design import gains as design
+from tools.design import model
+from tools.design.filter import LOCALISATIONS
 from tools.design.model import Corner, Mode, Nominal, Row, nominal_car, straight_leg
 
 PERIOD_S = 0.01
@@ -50,10 +52,16 @@ class FirmwareLaw:
         self.mode = mode
         self.speed_mps = row.speed_mps
         table = GainTable((0.0, row.speed_mps), 1, ((row[2:], row[2:]),) * 2)
-        self.gains = gains_at(table, 0, row.speed_mps, int(mode.with_yaw_rate))
+        self.gains = gains_at(table, 0, row.speed_mps)
         self.x_m = 100.0 if row.direction > 0 else 900.0
         self.poses_x = [self.x_m] * 60
-        self.state = estimator.begin()._replace(x_m=self.x_m, station_m=100.0)
+        self.localisation = LOCALISATIONS[mode.localisation]
+        self.state = estimator.begin()._replace(
+            x_m=self.x_m,
+            station_m=100.0,
+            noise=self.localisation.noise,
+            filter=model.filter_of(row, mode),
+        )
         self.integral_m2 = 0.0
         self.sent_rad = (0.0,) * QUEUE_LENGTH
 
@@ -70,7 +78,10 @@ class FirmwareLaw:
         )
         latency = car.pose_latency_samples if self.mode.predicts else 0
         pose_x_m = self.poses_x[-1 - latency]
-        self.state = estimator.estimate(leg, car, self.gains, self.state, motion, 1, pose_x_m, e_m, yaw_rad, latency)
+        stated_m, filters = self.localisation.stated_m, int(self.mode.predicts)
+        self.state = estimator.estimate(
+            leg, car, self.gains, self.state, motion, 1, pose_x_m, e_m, yaw_rad, latency, stated_m, filters
+        )  # fmt: skip
         assert self.state.disbelieved == 0
         _, e, heading, wheels_rad = predictor.predict(leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S)
         if not self.mode.predicts:

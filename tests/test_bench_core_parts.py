@@ -16,8 +16,8 @@ def test_the_row_of_the_schedule_is_found_at_every_grid_speed_and_between():
             speed_mps = grid[row] + share * (grid[row + 1] - grid[row])
             b = (speed_mps - grid[row]) / (grid[row + 1] - grid[row])
             low, high = table.gain[1][row], table.gain[1][row + 1]
-            found = gains_at(table, 1, speed_mps, 1)
-            for value, one, other in zip(found, low, high, strict=False):  # the rest is for without a yaw rate
+            found = gains_at(table, 1, speed_mps)
+            for value, one, other in zip(found, low, high, strict=True):
                 assert abs(value - ((1.0 - b) * one + b * other)) <= 1e-12 * max(abs(one), abs(other))
 
 

@@ -6,12 +6,14 @@ import random
 import pytest
 from core_support import shipped_tables
 
-from firmware_py.core import estimator
+from firmware_py.core import estimator, kalman
 from firmware_py.core.path import pose_at
 from firmware_py.core.schedule import gains_at
 
 FORWARD, REVERSE = 0, 1
 PERIOD_S = 0.01
+NOISE = kalman.begin_noise()._replace(position_m2=1e-4, yaw_rad2=3e-6, compared=kalman.COMPARED_MAX)
+WALKS = kalman.Walks(0.4e-3, 1e-3, 1e-3)
 
 
 class Drive:
@@ -26,6 +28,7 @@ class Drive:
         self.gyro_bias_radps = car.get("gyro_bias_radps", 0.0)
         self.odometry_scale = car.get("odometry_scale", 1.0)
         self.noise = car.get("noise", 0.0)
+        self.stated_m = car.get("stated_m", 0.01)
         self.rng = random.Random(1)
         self.station_m = 1.0
         self.poses = [self.pose()]
@@ -40,7 +43,17 @@ class Drive:
             road_wheel_angle_rad=rack_rad,
             modelled_angle_rad=rack_rad / self.steering_gain,
             averaged=estimator.MOVING_PRIOR,
+            bias_averaged=estimator.MOVING_PRIOR,
+            noise=NOISE,
+            filter=self.filter(),
         )
+
+    def filter(self):
+        """The filter of a car that has stood long and begins to drive."""
+        known = kalman.begin()._replace(covariance=kalman.averaged(300, NOISE.position_m2, NOISE.yaw_rad2, 0.0, 0.0))
+        body_m = self.leg.sigma * self.speed_mps * PERIOD_S * kalman.GAINS_EVERY
+        interval = kalman.Interval(body_m, 0, 0.01, estimator.MOVING_PRIOR, estimator.MOVING_PRIOR, 0, 1)
+        return kalman.advance(known, WALKS, NOISE, interval)
 
     def pose(self):
         """The car's pose on the path, body turned by its slip."""
@@ -86,7 +99,7 @@ class Drive:
             self.state = estimator.estimate(
                 self.leg,
                 self.car,
-                gains_at(self.tables.gains, self.direction, self.speed_mps, with_yaw_rate),
+                gains_at(self.tables.gains, self.direction, self.speed_mps),
                 self.state,
                 motion,
                 with_pose,
@@ -94,6 +107,8 @@ class Drive:
                 y_m + gauss(0.0, self.noise) + offset_m * math.cos(yaw_rad),
                 yaw_rad + gauss(0.0, 0.17 * self.noise),
                 latency,
+                self.stated_m,
+                1,
             )
         return self.state
 
@@ -115,8 +130,10 @@ def test_left_of_the_path_and_turned_left_are_positive_in_both_directions(direct
     left = (x_m - 0.1 * math.sin(yaw_rad), y_m + 0.1 * math.cos(yaw_rad))
     still = estimator.Motion(0.0, PERIOD_S, 0.0, 0.0, 1, 0.0, 1, 1, 0)
     state = estimator.begin()._replace(station_m=4.0)
-    gains = gains_at(shipped_tables().gains, direction, 0.0, 1)
-    state = estimator.estimate(leg, shipped_tables().car, gains, state, still, 1, *left, yaw_rad + slip_rad + 0.05, 1)
+    gains = gains_at(shipped_tables().gains, direction, 0.0)
+    state = estimator.estimate(
+        leg, shipped_tables().car, gains, state, still, 1, *left, yaw_rad + slip_rad + 0.05, 1, 0.01, 1
+    )
     assert state.cross_track_error_m == pytest.approx(0.1, abs=1e-9)
     assert state.heading_error_rad == pytest.approx(0.05, abs=1e-9)
     assert state.station_m == pytest.approx(4.0, abs=1e-9)
@@ -206,10 +223,10 @@ def test_nothing_drifts_at_standstill(with_yaw_rate):
     tables = shipped_tables()
     state = Drive(alignment_rad=0.01).cycles(300)
     still = estimator.Motion(0.0, PERIOD_S, 0.0, 0.0, 0, 0.003, with_yaw_rate, 1, 1)
-    gains = gains_at(tables.gains, FORWARD, 0.0, with_yaw_rate)
+    gains = gains_at(tables.gains, FORWARD, 0.0)
     after = state
     for _ in range(200):
-        after = estimator.estimate(tables.leg[0], tables.car, gains, after, still, 0, 0.0, 0.0, 0.0, 1)
+        after = estimator.estimate(tables.leg[0], tables.car, gains, after, still, 0, 0.0, 0.0, 0.0, 1, 0.01, 1)
     kept = ("x_m", "y_m", "yaw_rad", "road_disturbance_rad", "steering_gain", "steering_offset_rad", "odometry_scale")
     assert [getattr(after, name) for name in kept] == [getattr(state, name) for name in kept]
     assert after.cross_track_error_m == pytest.approx(state.cross_track_error_m, abs=1e-5)
@@ -219,10 +236,10 @@ def test_the_gyros_bias_is_learnt_at_standstill():
     tables = shipped_tables()
     rng = random.Random(4)
     state = estimator.begin()
-    gains = gains_at(tables.gains, FORWARD, 0.0, 1)
+    gains = gains_at(tables.gains, FORWARD, 0.0)
     for _ in range(400):
         still = estimator.Motion(0.0, PERIOD_S, 0.0, 0.0, 1, 0.002 + rng.gauss(0.0, 3.5e-4), 1, 1, 0)
-        state = estimator.estimate(tables.leg[0], tables.car, gains, state, still, 0, 0.0, 0.0, 0.0, 1)
+        state = estimator.estimate(tables.leg[0], tables.car, gains, state, still, 0, 0.0, 0.0, 0.0, 1, 0.01, 1)
     assert state.gyro_bias_radps == pytest.approx(0.002, abs=6e-5)
 
 
@@ -231,11 +248,11 @@ def test_standing_poses_are_averaged_to_their_mean():
     rng = random.Random(3)
     state = estimator.begin()
     leg = tables.leg[FORWARD]
-    gains = gains_at(tables.gains, FORWARD, 0.0, 1)
+    gains = gains_at(tables.gains, FORWARD, 0.0)
     still = estimator.Motion(0.0, PERIOD_S, 0.0, 0.0, 1, 0.0, 1, 1, 0)
     poses = [(leg.x_m[0] + rng.gauss(0, 0.01), rng.gauss(0.02, 0.01), rng.gauss(0, 0.002)) for _ in range(100)]
     for pose in poses:
-        state = estimator.estimate(leg, tables.car, gains, state, still, 1, *pose, 1)
+        state = estimator.estimate(leg, tables.car, gains, state, still, 1, *pose, 1, 0.01, 1)
     mean_m = sum(pose[1] for pose in poses) / len(poses)
     assert state.y_m == pytest.approx(mean_m, abs=2e-4)
     assert state.averaged == 100

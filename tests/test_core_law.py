@@ -10,7 +10,7 @@ from firmware_py.core import controller, motion, pid
 from firmware_py.core import signals as s
 from firmware_py.core.path import feedforward_at, feedforward_curvature_1pm, pose_at, wrap_angle
 from firmware_py.core.schedule import gains_at
-from firmware_py.core.tables import GAIN_COLUMNS, KP, L_EE, M_EE
+from firmware_py.core.tables import GAIN_COLUMNS, KP
 
 FORWARD, REVERSE = 0, 1
 
@@ -71,21 +71,13 @@ def test_the_model_on_the_path_with_the_feedforward_stays_on_the_path(direction)
     assert pushed[2] * leg.sigma > 0
 
 
-ESTIMATORS = {1: (*range(5), *range(L_EE, M_EE)), 0: (*range(5), *range(M_EE, GAIN_COLUMNS))}
-"""Columns that are in force with a fresh yaw rate (1) and without (0)."""
-
-
-@pytest.mark.parametrize("with_yaw_rate", [0, 1])
-def test_gains_are_exactly_those_of_the_row_and_held_beyond_the_grid(with_yaw_rate):
+def test_gains_are_exactly_those_of_the_row_and_held_beyond_the_grid():
     table = shipped_tables().gains
     for direction in (FORWARD, REVERSE):
         for row, speed_mps in enumerate(table.speed_grid_mps):
-            expected = [table.gain[direction][row][column] for column in ESTIMATORS[with_yaw_rate]]
-            found = gains_at(table, direction, speed_mps, with_yaw_rate)
-            assert list(found)[: len(expected)] == pytest.approx(expected, abs=1e-13)
-        assert gains_at(table, direction, 99.0, with_yaw_rate) == gains_at(
-            table, direction, table.speed_grid_mps[-1], with_yaw_rate
-        )
+            found = gains_at(table, direction, speed_mps)
+            assert list(found) == pytest.approx(table.gain[direction][row], abs=1e-13)
+        assert gains_at(table, direction, 99.0) == gains_at(table, direction, table.speed_grid_mps[-1])
 
 
 @pytest.mark.parametrize("column", range(GAIN_COLUMNS))
@@ -99,12 +91,10 @@ def test_changing_one_row_of_one_direction_changes_nothing_else(column):
     for step in range(1101):
         speed_mps = step * 1e-3
         inside = grid[row - 1] < speed_mps < grid[row + 1]
-        for with_yaw_rate, columns in ESTIMATORS.items():
-            asked = (speed_mps, with_yaw_rate)
-            assert gains_at(changed, FORWARD, *asked) == gains_at(table, FORWARD, *asked)
-            before, after = gains_at(table, REVERSE, *asked), gains_at(changed, REVERSE, *asked)
-            for of_column, one, other in zip(columns, before, after, strict=False):
-                assert (abs(other - one) > 1e-9) == (inside and of_column == column)
+        assert gains_at(changed, FORWARD, speed_mps) == gains_at(table, FORWARD, speed_mps)
+        before, after = gains_at(table, REVERSE, speed_mps), gains_at(changed, REVERSE, speed_mps)
+        for of_column, (one, other) in enumerate(zip(before, after, strict=True)):
+            assert (abs(other - one) > 1e-9) == (inside and of_column == column)
 
 
 def command_beside_the_path_rad(used_tables, left_m):
@@ -148,7 +138,7 @@ def test_the_feedback_is_linear_near_the_path_and_bounded_far_from_it():
 
 
 def test_the_integral_stands_still_while_limited_and_stays_within_its_authority():
-    gains = gains_at(shipped_tables().gains, FORWARD, 0.5, 1)._replace(ki=0.4)
+    gains = gains_at(shipped_tables().gains, FORWARD, 0.5)._replace(ki=0.4)
     assert pid.integrate_m2(0.01, 0.05, 0.01, gains, 1) == 0.01
     integral = 0.0
     for _ in range(100_000):
@@ -186,7 +176,7 @@ def test_the_push_is_what_the_nominal_actuator_would_still_lack_when_a_command_b
 @pytest.mark.parametrize("sigma", [1.0, -1.0])
 def test_a_car_far_off_comes_back_at_an_angle_of_about_one_and_a_half_degrees(sigma):
     """At that angle the feedback changes its sign, however far off the car is."""
-    gains = gains_at(shipped_tables().gains, FORWARD, 1.0, 1)
+    gains = gains_at(shipped_tables().gains, FORWARD, 1.0)
     for e_m in (0.03, 0.05, 0.5):
         for heading_rad, sign in ((math.radians(1.0), 1.0), (math.radians(1.8), -1.0)):
             error_m = pid.preview_error_m(e_m, -sigma * heading_rad, gains.preview_m, sigma)

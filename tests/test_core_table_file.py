@@ -9,7 +9,7 @@ from core_support import ROOT, TABLES
 from firmware_py.core.controller import PERIOD_S
 from firmware_py.core.tables import LAW_CAR, LAW_PLAIN
 from firmware_py.errors import UserError
-from firmware_py.table_file import load_tables
+from firmware_py.table_file import FORMAT, load_tables
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_changed_source_makes_the_tables_stale(folder, tmp_path):
 def test_malformed_manifest(folder):
     manifest = folder / "manifest.toml"
     text = manifest.read_text()
-    manifest.write_text(text.replace("format = 1", "format = 9"))
+    manifest.write_text(text.replace(f"format = {FORMAT}", "format = 9"))
     assert "format 9" in refused(folder)
     manifest.write_text(text.replace("vehicle_hash24", "vehicle_hash"))
     assert "key vehicle_hash24 is missing" in refused(folder)

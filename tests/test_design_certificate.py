@@ -28,7 +28,7 @@ SLOW = {"lag": corner(steering_lag_s=0.2, pose_latency_samples=2, steering_gain=
 def of_rows(law, direction, speed_mps):
     """A row and its controller, in the law's usual mode."""
     row = row_at(designed()[law], direction, speed_mps)
-    return row, model.controller(row, NOMINAL, design.MODES[law][0])
+    return row, model.controller(row, NOMINAL, design.MODES[law][law])
 
 
 # Against python-control
@@ -88,7 +88,12 @@ def first_unstable(test, low, high, steps=5):
     return 0.5 * (low + high)
 
 
-CASES = [(1.0, "car", 0), (-1.0, "car", 1), (-1.0, "pid_ff", 0)]
+CASES = [
+    (1.0, "car", "car"),
+    (1.0, "car", "car, poses with slow noise"),
+    (-1.0, "car", "car, without the yaw rate"),
+    (-1.0, "pid_ff", "pid_ff"),
+]
 
 
 @pytest.mark.parametrize(("direction", "law", "mode"), CASES)
@@ -112,7 +117,7 @@ def test_the_lag_at_which_it_breaks_is_the_one_that_the_model_foretells(directio
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_the_delay_margin_is_the_latency_at_which_it_breaks(direction):
     row, system = of_rows("car", direction, 1.0)
-    mode = design.MODES["car"][0]
+    mode = design.MODES["car"]["car"]
     base = SLOW["lag"]
     omega = design.frequencies(1.0, 600)
     margin = margins_of(model.loop_response(system, row, [base], design.on_circle(omega))[0], omega).delay_samples
@@ -149,6 +154,10 @@ def test_the_shipped_cars_are_certified(certificate):
     without = certificate.others["car, without the yaw rate"]
     assert without["min_disk_margin"] >= 0.34
     assert without["min_delay_margin_samples"] >= 8.0
+    for poses in ("without noise", "with slow noise"):
+        found = certificate.others[f"car, poses {poses}"]
+        assert found["min_disk_margin"] >= 0.6
+        assert found["min_delay_margin_samples"] >= 12.0
     assert certificate.min_disk_margin == min(disk for _, _, disk, _ in certificate.by_speed)
 
 

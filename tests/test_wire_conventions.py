@@ -13,7 +13,7 @@ from cantools.database.can import Message
 from test_wire_independent import LAYOUT, bitwise_crc, encode
 
 from firmware_py.codec import load_codec
-from firmware_py.core import estimator, health, manoeuvre, speed, supervisor
+from firmware_py.core import estimator, health, kalman, manoeuvre, speed, supervisor
 from firmware_py.core.signals import QUALITY_FIXED
 from sim.data_files import PARAMETERS, load_course, load_vehicle, shipped_names
 
@@ -222,6 +222,10 @@ def test_the_other_figures_are_those_of_the_controller() -> None:
     assert f"not Active {supervisor.ENABLE_TIMEOUT_US * 1e-6:g} s after the request" in flat
     assert f"`enable_request` 0 for {supervisor.CLEAR_PULSE_US * 1e-6:g} s" in flat
     assert f"`gear_change_s` and {manoeuvre.GEAR_PATIENCE_US * 1e-6:g} s more" in flat
+    assert f"more than {kalman.SLOW_NOISE_M * 1e3:g} mm, steps 6 and 8 take {manoeuvre.SETTLE_US * 1e-6:g} s" in flat
+    assert f"(white noise of {kalman.UNKNOWN_SIGMA_M * 1e2:g} cm is assumed)" in flat
+    assert f"above {health.POSITION_SIGMA_MAX_M:g} the pose counts as poor" in flat
+    assert f"`position_sigma_m` above {health.POSITION_SIGMA_MAX_M:g} |" in flat
     assert f"both enables 0, brake {speed.HOLD_DECEL_MPS2:g} m/s^2" in flat
     assert f"quality | Fixed ({QUALITY_FIXED})" in flat
 

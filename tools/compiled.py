@@ -28,6 +28,7 @@ CORE_MODULES = (
     "path",
     "schedule",
     "motion",
+    "kalman",
     "estimator",
     "predictor",
     "pid",

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from firmware_py.core import conditions as c
-from firmware_py.core import estimator, health, limits, manoeuvre, paper_law, pid, predictor, speed, supervisor
+from firmware_py.core import estimator, health, kalman, limits, manoeuvre, paper_law, pid, predictor, speed, supervisor
 from firmware_py.core import gate as last_gate
 from firmware_py.core.bounds import bounded
 from firmware_py.core.motion import QUEUE_LENGTH
@@ -153,6 +153,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
             standstill,
             reference.stopping,
             angle_meas_rad - last_rad,
+            law == LAW_CAR and estimated.filter.slow_m2 > kalman.SLOW_NOISE_M * kalman.SLOW_NOISE_M,
             PERIOD_US,
         )
     elif mode == MODE_FAULT:
@@ -188,7 +189,7 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         standstill,
         follows,
     )
-    gains = gains_at(tables.gains, direction, travel_mps, moved.yaw_rate_is_fresh)
+    gains = gains_at(tables.gains, direction, travel_mps)
     estimated = estimator.estimate(
         leg,
         car,
@@ -200,6 +201,8 @@ def step(tables: Tables, state: State, inputs: Inputs) -> tuple[State, Outputs]:
         position.position_y_m,
         attitude.yaw_rad,
         car.pose_latency_samples if law == LAW_CAR else 0,
+        attitude.position_sigma_m,
+        1 if law == LAW_CAR else 0,
     )
     station_m, cross_m, heading_rad, angle_rad = predictor.predict(
         leg, car, estimated, sent_angles_rad, travel_mps, PERIOD_S

@@ -12,13 +12,14 @@ It is the disturbance observer of the law. Its states live at the instant of the
 
 A pose report is old when it comes; it is carried to now by the way that odometry has gone since. Without a fresh yaw
 rate the heading is carried by the steering and the road disturbance, which the poses then correct; without a fresh
-angle the nominal actuator's stands in for the measured one. The gains come from the gain table, indexed by (direction,
-speed), one set with the yaw rate and one without.
+angle the nominal actuator's stands in for the measured one. How much a pose corrects place, heading and bias (or road
+disturbance) is the Kalman filter's (`firmware_py.core.kalman`); the rest comes from the gain table.
 """
 
 import math
 from typing import NamedTuple
 
+from firmware_py.core import kalman
 from firmware_py.core.bounds import bounded
 from firmware_py.core.path import pose_at, wrap_angle
 from firmware_py.core.schedule import Gains
@@ -39,14 +40,21 @@ GATE_CROSS_M = 0.15
 GATE_HEADING_RAD = 0.08
 """A pose farther than this from the expected one is not believed; several in a row are a fault (health)."""
 
+STANDING_GATE_M = 0.05
+STANDING_GATE_SIGMAS = 5.0
+"""While the vehicle does not follow, a pose this far aside, or so many of its own standard deviations, begins a new
+average: the car or its localisation has been moved, and the start is judged by where it is now."""
+
 AVERAGING_MAX = 400
-"""Poses averaged at standstill, at most; then a first-order filter of that length."""
+"""Poses of a standing car that its place along the path is the average of, at most; then a first-order filter of that
+length. So are place across and heading, of the first `kalman.AVERAGED_POSES`, or with a law without filter."""
 
 BIAS_AVERAGING_MAX = 1000
 """Yaw rates averaged at standstill for the gyro's bias, at most."""
 
 MOVING_PRIOR = 300
-"""What the estimate of a moving car is worth when it comes to a stop, counted in poses and in yaw rates."""
+"""What the estimate of a moving car is worth when it comes to a stop, counted in poses (along the path) and in yaw
+rates (for the gyro's bias)."""
 
 STEERING_GAIN_1PM = 1.0
 STEERING_GAIN_ANGLE_RAD = 0.1
@@ -68,8 +76,11 @@ class EstimatorState(NamedTuple):
     """Pose (course frame), its errors relative to the path, disturbances and the memory of the last cycles.
 
     `road_wheel_angle_rad` is the measured angle or what stands in for it, `modelled_angle_rad` the nominal actuator's
-    answer to the commands, `yaw_rate_radps` the last one used. `averaged` counts the poses averaged at standstill,
-    `bias_averaged` the yaw rates, `disbelieved` the poses refused in a row. `odometry_*` is the way gone, newest first.
+    answer to the commands, `yaw_rate_radps` the last one used. `averaged` counts the poses since the car stands at one
+    place, `bias_averaged` the yaw rates, `disbelieved` the poses refused in a row. `odometry_*` is the way gone, newest
+    first. `slow_*` is the part of the poses' noise that stays for seconds, as the newest pose had it. `cycles`,
+    `poses`, `yaw_rates` and `body_m` are those since the filter's gains were made: how many, how many believed, how
+    many fresh, and the way along the body.
     """
 
     x_m: float
@@ -92,6 +103,14 @@ class EstimatorState(NamedTuple):
     odometry_x_m: tuple[float, ...]
     odometry_y_m: tuple[float, ...]
     odometry_yaw_rad: tuple[float, ...]
+    slow_cross_m: float
+    slow_heading_rad: float
+    cycles: int
+    poses: int
+    yaw_rates: int
+    body_m: float
+    noise: kalman.SeenNoise
+    filter: kalman.Filter
 
 
 class Motion(NamedTuple):
@@ -137,6 +156,14 @@ def begin() -> EstimatorState:
         odometry_x_m=way,
         odometry_y_m=way,
         odometry_yaw_rad=way,
+        slow_cross_m=0.0,
+        slow_heading_rad=0.0,
+        cycles=kalman.GAINS_EVERY // 2,
+        poses=0,
+        yaw_rates=0,
+        body_m=0.0,
+        noise=kalman.begin_noise(),
+        filter=kalman.begin(),
     )
 
 
@@ -151,10 +178,14 @@ def estimate(
     position_y_m: float,
     yaw_rad: float,
     pose_latency_samples: int,
+    stated_sigma_m: float,
+    filters: int,
 ) -> EstimatorState:
     """Return the state one cycle later: carried on by the car's motion, corrected if a pose arrived.
 
     While the vehicle follows, a pose beyond the gate is not believed; else, at standstill, it begins a new average.
+    `stated_sigma_m` is the position's standard deviation, of which the localisation tells (0: it does not know). With
+    `filters` 0 the poses of a moving car are taken as they come.
     """
     (
         x_m,
@@ -177,6 +208,14 @@ def estimate(
         odometry_x_m,
         odometry_y_m,
         odometry_yaw_rad,
+        slow_cross_m,
+        slow_heading_rad,
+        cycles,
+        poses,
+        yaw_rates,
+        gone_m,
+        noise,
+        known,
     ) = state
     odometry_m, dt_s, acted_rad, meas_rad, angle_is_fresh, yaw_rate_radps, yaw_rate_is_fresh, standstill, follows = (
         motion
@@ -212,6 +251,7 @@ def estimate(
     sin_path = math.sin(path_yaw_rad)
 
     # Heading and place, one cycle on.
+    body_m = sigma * ds_m
     turn_rad = 0.0
     dx_m = 0.0
     dy_m = 0.0
@@ -221,7 +261,6 @@ def estimate(
             bias_radps += (yaw_rate_radps - bias_radps) / bias_averaged
             bias_radps = max(min(bias_radps, GYRO_BIAS_MAX_RADPS), -GYRO_BIAS_MAX_RADPS)
     else:
-        body_m = sigma * ds_m
         mean_rad = 0.5 * (last_angle_rad + angle_rad) + road_rad
         turn_rad = body_m * (math.tan(mean_rad) / car.wheelbase_m - slip_1pm)
         if yaw_rate_is_fresh != 0:
@@ -250,6 +289,8 @@ def estimate(
     cross_m = dy_m * cos_path - dx_m * sin_path
     heading_rad = wrap_angle(own_yaw_rad - path_yaw_rad - slip_rad)
 
+    slow_cross_m *= kalman.KEPT
+    slow_heading_rad *= kalman.KEPT
     if pose_is_new != 0:
         # The pose, carried to now by the way gone since it was taken, against the estimate, in the path's frame.
         n = pose_latency_samples
@@ -258,39 +299,64 @@ def estimate(
         new_heading_rad = wrap_angle(yaw_rad + odometry_yaw_rad[0] - odometry_yaw_rad[n] - own_yaw_rad)
         new_along_m = dx_m * cos_path + dy_m * sin_path
         new_cross_m = dy_m * cos_path - dx_m * sin_path
+        gate_m = GATE_CROSS_M
+        if follows == 0:
+            gate_m = bounded(STANDING_GATE_SIGMAS * stated_sigma_m, STANDING_GATE_M, GATE_CROSS_M)
         believed = (
-            abs(new_cross_m) <= GATE_CROSS_M
-            and abs(new_along_m) <= GATE_CROSS_M
-            and abs(new_heading_rad) <= GATE_HEADING_RAD
+            abs(new_cross_m) <= gate_m and abs(new_along_m) <= gate_m and abs(new_heading_rad) <= GATE_HEADING_RAD
         )
         along_m = 0.0
         left_m = 0.0
         turned_rad = 0.0
+        taken = 0  # by the filter's gains
         if standstill != 0 and (believed or follows == 0):
             if not believed:
                 averaged = 0
-            averaged = min(averaged + 1, AVERAGING_MAX)
+            if averaged < AVERAGING_MAX:
+                averaged += 1
             along_m = new_along_m / averaged
-            left_m = new_cross_m / averaged
-            turned_rad = new_heading_rad / averaged
+            noise = kalman.compare(noise, position_x_m, position_y_m, yaw_rad, averaged == 1)
+            if averaged <= kalman.AVERAGED_POSES or filters == 0:
+                left_m = new_cross_m / averaged
+                turned_rad = new_heading_rad / averaged
+                slow_cross_m = 0.0
+                slow_heading_rad = 0.0
+            else:
+                taken = 1
+            poses += 1
             disbelieved = 0
         elif believed:
             along_m = STATION_GAIN * new_along_m
-            left_m = gains.ee * new_cross_m + gains.ep * new_heading_rad
-            turned_rad = gains.pe * new_cross_m + gains.pp * new_heading_rad
-            learnt = gains.xe * new_cross_m + gains.xp * new_heading_rad
-            if yaw_rate_is_fresh != 0:
-                bias_radps += learnt
-            else:
-                road_rad += car.wheelbase_m * learnt
             scale += SCALE_GAIN_1PM2 * abs(ds_m) * sigma * new_along_m
             scale = bounded(scale, 1.0 - ODOMETRY_SCALE_MAX, 1.0 + ODOMETRY_SCALE_MAX)
             averaged += 1
             if averaged > MOVING_PRIOR:
                 averaged = MOVING_PRIOR
+            if filters != 0:
+                taken = 1
+            else:
+                left_m = new_cross_m
+                turned_rad = new_heading_rad
+            poses += 1
             disbelieved = 0
         else:
             disbelieved += 1
+        if taken != 0:
+            ee, ep, pe, pp, xe, xp, se, sp, te, tp = known.gains
+            cross_gap_m = bounded(new_cross_m - slow_cross_m, -known.most_cross_m, known.most_cross_m)
+            heading_gap_rad = new_heading_rad - slow_heading_rad
+            heading_gap_rad = bounded(heading_gap_rad, -known.most_heading_rad, known.most_heading_rad)
+            left_m = ee * cross_gap_m + ep * heading_gap_rad
+            turned_rad = pe * cross_gap_m + pp * heading_gap_rad
+            # What is beyond the usual is a jump of the localisation, and not of the car.
+            slow_cross_m = new_cross_m - cross_gap_m + se * cross_gap_m + sp * heading_gap_rad
+            slow_heading_rad = new_heading_rad - heading_gap_rad + te * cross_gap_m + tp * heading_gap_rad
+            if known.with_yaw_rate == yaw_rate_is_fresh:
+                learnt = xe * cross_gap_m + xp * heading_gap_rad
+                if yaw_rate_is_fresh != 0:
+                    bias_radps += learnt
+                else:
+                    road_rad += car.wheelbase_m * learnt
         x_m += along_m * cos_path - left_m * sin_path
         y_m += along_m * sin_path + left_m * cos_path
         own_yaw_rad += turned_rad
@@ -298,10 +364,30 @@ def estimate(
         cross_m += left_m
         heading_rad += turned_rad
     if standstill == 0:
+        if noise.stood != 0:
+            noise = kalman.moved(noise)
         if bias_averaged > MOVING_PRIOR:
             bias_averaged = MOVING_PRIOR
         road_rad = bounded(road_rad, -ROAD_DISTURBANCE_MAX_RAD, ROAD_DISTURBANCE_MAX_RAD)
         bias_radps = bounded(bias_radps, -GYRO_BIAS_MAX_RADPS, GYRO_BIAS_MAX_RADPS)
+
+    cycles += 1
+    yaw_rates += yaw_rate_is_fresh
+    gone_m += body_m
+    if cycles >= kalman.GAINS_EVERY:
+        with_yaw_rate = 1 if 2 * yaw_rates >= cycles else 0
+        if filters != 0:
+            walks = kalman.Walks(gains.cross_walk, gains.heading_walk, gains.road_walk)
+            interval = kalman.Interval(
+                gone_m, poses, stated_sigma_m, averaged, bias_averaged, standstill, with_yaw_rate
+            )
+            known = kalman.advance(known, walks, noise, interval)
+        elif averaged > 0:
+            known = kalman.as_they_come(noise, stated_sigma_m, averaged if standstill != 0 else 1)
+        cycles = 0
+        poses = 0
+        yaw_rates = 0
+        gone_m = 0.0
 
     return EstimatorState(
         x_m,
@@ -324,6 +410,14 @@ def estimate(
         odometry_x_m,
         odometry_y_m,
         odometry_yaw_rad,
+        slow_cross_m,
+        slow_heading_rad,
+        cycles,
+        poses,
+        yaw_rates,
+        gone_m,
+        noise,
+        known,
     )
 
 
@@ -350,4 +444,12 @@ def turn_round(leg: LegTable, state: EstimatorState) -> EstimatorState:
         state.odometry_x_m,
         state.odometry_y_m,
         state.odometry_yaw_rad,
+        state.slow_cross_m,
+        state.slow_heading_rad,
+        state.cycles,
+        state.poses,
+        state.yaw_rates,
+        state.body_m,
+        state.noise,
+        state.filter,
     )

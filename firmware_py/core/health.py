@@ -71,6 +71,10 @@ OVERRUN_BUCKET = 25
 OVERRUN_LEAK_CYCLES = 10
 
 REJECTED_US = 60_000
+POSITION_SIGMA_MAX_M = 0.05
+"""Standard deviation that the localisation may state: with more of it the poses would hardly correct the car any more,
+and the room to the cones is not much more than three times as large."""
+
 SETTLED_POSES = 50
 """Poses to average at standstill before the start: brings 1 cm of noise below 2 mm."""
 
@@ -181,7 +185,11 @@ def assess(
     steer_is_new = steer_n != NO_COUNTER and steer.steer_angle_valid != 0
     motion_is_new = motion_n != NO_COUNTER and motion.speed_valid != 0
     # A pose is position and yaw of one sample (equal counters), both of full quality.
-    pose_poor = position.position_quality != QUALITY_FIXED or attitude.yaw_quality != QUALITY_FIXED
+    pose_poor = (
+        position.position_quality != QUALITY_FIXED
+        or attitude.yaw_quality != QUALITY_FIXED
+        or attitude.position_sigma_m > POSITION_SIGMA_MAX_M
+    )
     pose_is_new = position_n != NO_COUNTER and position_n == attitude_n and not pose_poor
     sys_us, sys_lost = NEW if sys_n != NO_COUNTER else _older(sys_us, period_us, timeouts.sys_us)
     steer_us, steer_lost = NEW if steer_is_new else _older(steer_us, period_us, timeouts.steer_us)

@@ -1,7 +1,7 @@
 """The sequence of the manoeuvre: forward leg, one direction change at standstill, reverse leg, park.
 
-Each leg begins at standstill: the gear is engaged and the wheels are steered to where the leg begins, then the car
-goes. Nothing here moves the car while it waits.
+Each leg begins at standstill: the gear is engaged, the wheels are steered to where the leg begins, and where the poses
+are noisy for seconds their noise is waited for; then the car goes. Nothing here moves the car while it waits.
 """
 
 from typing import NamedTuple
@@ -23,6 +23,10 @@ STEERED_RAD = 0.01
 STEER_WAIT_US = 500_000
 """Before a leg the wheels turn at standstill until they are this near to the command, but at most for so long: what
 remains then is a disturbance that the observer learns."""
+
+SETTLE_US = 10_000_000
+"""How long the car stands before a leg where the poses' noise stays for seconds: twice as long as it stays
+(`kalman.SLOW_S`), in which the standing poses tell more of it."""
 
 GEAR_PATIENCE_US = 2_000_000
 """How much longer than the vehicle file says a gear change may take before it counts as failed."""
@@ -69,6 +73,7 @@ def proceed(
     standstill: bool,
     stopping: int,
     steering_gap_rad: float,
+    pose_noise_is_slow: bool,
     period_us: int,
 ) -> ManoeuvreState:
     """Return the next state while the manoeuvre is Active."""
@@ -87,9 +92,10 @@ def proceed(
         gear_failed = 1
     steering_us = state.steering_us + period_us
     steered = abs(steering_gap_rad) < STEERED_RAD or steering_us > STEER_WAIT_US
+    settled = not pose_noise_is_slow or waiting_us > SETTLE_US
     leg = state.leg
     driving = 0
-    if geared and steered and standstill and leg != LEG_COMPLETE:
+    if geared and steered and settled and standstill and leg != LEG_COMPLETE:
         driving = 1
         if leg == LEG_DIRECTION_CHANGE:
             leg = LEG_REVERSE

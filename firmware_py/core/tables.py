@@ -13,10 +13,8 @@ FORWARD = 0
 REVERSE = 1
 
 # Columns of a gain schedule's row, in the order of the file.
-PREVIEW, KP, KI, KD, L_O = range(5)
-L_EE, L_EP, L_PE, L_PP, L_BE, L_BP, L_DR = range(5, 12)  # with the yaw rate
-M_EE, M_EP, M_PE, M_PP, M_DE, M_DP = range(12, 18)  # without it
-GAIN_COLUMNS = 18
+PREVIEW, KP, KI, KD, L_O, L_DR, W_E, W_P, W_D = range(9)
+GAIN_COLUMNS = 9
 
 # The laws: PID on the poses as they come; on what estimator and predictor make of them; the paper's own (`paper_law`).
 LAW_PLAIN, LAW_CAR, LAW_PAPER = range(3)

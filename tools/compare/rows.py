@@ -142,7 +142,7 @@ def _shipped(tables: Tables, direction: int, seen: Seen) -> float:
     state = begin()
     estimated = state.estimator
     estimated = estimated._replace(station_m=seen.station_m, cross_track_error_m=seen.cross_m)
-    gains = gains_at(tables.gains, direction, seen.travel_mps, 1)
+    gains = gains_at(tables.gains, direction, seen.travel_mps)
     station_m, cross_m, heading_rad, _angle_rad = predictor.predict(
         leg, car, estimated, state.sent_angles_rad, seen.travel_mps, PERIOD_S
     )

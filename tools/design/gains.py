@@ -1,11 +1,11 @@
-"""Gain schedules by direction and speed: estimator from Riccati equations, PID as fast as the margins allow.
+"""Gain schedules by direction and speed: the estimator's noises, and a PID as fast as the margins allow.
 
 Everything is designed per metre of travel and stated for curvature, so that it hardly depends on the wheelbase. The
-estimator's gains are steady-state Kalman gains: process noise per root metre and per root second, the pose's noise per
-sample, so that a slowly travelled metre is averaged over more poses and the gains depend on the speed. The PID is one
-pattern of poles per metre (`pid_gains`), scaled by a pace. At every speed of the grid the pace is the largest one, up
-to the law's own, with which the nominal car and every corner of the vehicle's box keep their poles in the D-region
-(`d_stable`) and their disk margin (`least_disk_margin`), both with a reserve over what the vehicle's file asks for.
+estimator's filter makes its gains itself, while it runs; margins are those with the gains that it has in the long run
+(`tools.design.filter`). The PID is one pattern of poles per metre (`pid_gains`), scaled by a pace. At every speed of
+the grid the pace is the largest one, up to the law's own, with which the nominal car and every corner of the vehicle's
+box keep their poles in the D-region (`d_stable`) and their disk margin (`least_disk_margin`), both with a reserve over
+what the vehicle's file asks for.
 """
 
 import itertools
@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.covariance import HEADING_WALK, YAW_RATE_NOISE_RADPS
 from firmware_py.core.estimator import ODOMETRY_LENGTH
+from firmware_py.core.kalman import YAW_RATE_NOISE_RADPS
 from firmware_py.core.motion import QUEUE_LENGTH
 from sim.data_files import Criteria, Vehicle
 from sim.errors import UserError
@@ -27,25 +27,20 @@ from tools.design.model import Complexes, Floats, Mode, Row
 LAWS = ("car", "pid_ff")
 """As in the names of their tables; `pid_ff` takes each pose as it comes."""
 
-MODES: dict[str, tuple[Mode, ...]] = {
-    "car": (Mode(predicts=True, with_yaw_rate=True), Mode(predicts=True, with_yaw_rate=False)),
-    "pid_ff": (Mode(predicts=False, with_yaw_rate=True),),
+MODES: dict[str, dict[str, Mode]] = {
+    "car": {
+        "car": Mode(),
+        "car, poses without noise": Mode(localisation="exact"),
+        "car, poses with slow noise": Mode(localisation="slow"),
+        "car, without the yaw rate": Mode(with_yaw_rate=False),
+    },
+    "pid_ff": {"pid_ff": Mode(predicts=False)},
 }
-"""How each law runs; the first is the usual one."""
+"""How each law runs; the first is the usual one, for which its gains are chosen."""
 
 COLUMNS = Row._fields
 
 SPEED_GRID_MPS = (0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-
-POSITION_NOISE_M = 0.01
-HEADING_NOISE_RAD = math.radians(0.1)
-"""Noise of one pose, of the localisation that the design assumes."""
-
-YAW_RATE_WALK = math.radians(0.002)
-"""Walk of the gyro's bias, rad/s per root second."""
-
-SIDE_SLIP = 0.25e-3
-"""With the yaw rate: what the rear tyres' unknown slip moves the car aside, m per root metre of travel."""
 
 ROAD_WALK_1PM = 0.5e-3
 """Change of the road disturbance per root metre: the play of the steering goes from one side to the other."""
@@ -183,60 +178,6 @@ def _ends(interval: tuple[float, float]) -> tuple[float, ...]:
 # --------------------------------------------------------------------------------------------------------------------
 
 
-def _kalman(f: Floats, h: Floats, q: Floats, r: Floats) -> Floats:
-    """Steady-state Kalman gains, shape (states, measurements)."""
-    from scipy.linalg import solve_discrete_are  # noqa: PLC0415  (heavy, and only the design needs it)
-
-    # In units of the noises: the solver is accurate where numbers are alike.
-    unit = np.array([POSITION_NOISE_M, HEADING_NOISE_RAD, max(30.0 * math.sqrt(q[2, 2]), 1e-9)])
-    covariance = solve_discrete_are(
-        (f * unit / unit[:, None]).T,
-        (h * unit / unit[:2, None]).T,
-        q / np.outer(unit, unit),
-        r / np.outer(unit[:2], unit[:2]),
-    ) * np.outer(unit, unit)
-    gains = np.asarray(covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r))
-    gains.setflags(write=False)
-    return gains
-
-
-POSE_NOISE = np.diag([POSITION_NOISE_M**2, HEADING_NOISE_RAD**2])
-POSE = np.eye(2, 3)
-
-
-def gyro_model(direction: float, speed_mps: float) -> tuple[Floats, Floats]:
-    """The estimator with the yaw rate: F and process noise of (cross-track error, heading error, gyro's bias)."""
-    ds, dt = speed_mps * model.PERIOD_S, model.PERIOD_S
-    f = np.array([[1.0, direction * ds, -0.5 * direction * ds * dt], [0.0, 1.0, -dt], [0.0, 0.0, 1.0]])
-    heading = HEADING_WALK**2 * ds + (YAW_RATE_NOISE_RADPS * dt) ** 2
-    return f, np.diag([SIDE_SLIP**2 * ds, heading, YAW_RATE_WALK**2 * dt])
-
-
-def steering_model(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> tuple[Floats, Floats]:
-    """The estimator without it: F and process noise of (cross-track error, heading error, road disturbance)."""
-    ds = speed_mps * model.PERIOD_S
-    turn = direction * ds
-    f = np.array([[1.0, turn, 0.5 * ds * ds], [0.0, 1.0, turn], [0.0, 0.0, 1.0]])
-    return f, np.diag([value * value * ds for value in noise])
-
-
-@cache
-def gyro_gains(direction: float, speed_mps: float) -> Floats:
-    """Kalman gains per cycle of (cross-track error, heading error, gyro's bias), shape (3, 2); zeros at standstill."""
-    if speed_mps == 0.0:
-        return np.broadcast_to(0.0, (3, 2))
-    return _kalman(gyro_model(direction, speed_mps)[0], POSE, gyro_model(direction, speed_mps)[1], POSE_NOISE)
-
-
-@cache
-def steering_gains(direction: float, speed_mps: float, noise: tuple[float, float, float]) -> Floats:
-    """Kalman gains per cycle of (cross-track error, heading error, road disturbance), shape (3, 2)."""
-    if speed_mps == 0.0:
-        return np.broadcast_to(0.0, (3, 2))
-    f, q = steering_model(direction, speed_mps, noise)
-    return _kalman(f, POSE, q, POSE_NOISE)
-
-
 @cache
 def road_gain(direction: float, speed_mps: float) -> float:
     """Kalman gain of the road disturbance for the gap between yaw rate and steering over a cycle, 1/m for a radian."""
@@ -252,22 +193,20 @@ def road_gain(direction: float, speed_mps: float) -> float:
 
 def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float) -> Row:
     """A row of the gain table; a law that takes each pose as it comes estimates nothing, whatever its pace."""
-    with_yaw_rate = without = np.eye(3, 2)
     offset = road = 0.0
+    walks = (0.0, 0.0, 0.0)
     if law == "car":
-        with_yaw_rate = gyro_gains(direction, speed_mps)
-        without = steering_gains(direction, speed_mps, observer_noise(observer_pace))
-        road = road_gain(direction, speed_mps)
         offset = 1.0 - math.exp(-speed_mps * model.PERIOD_S / OFFSET_LENGTH_M)
+        road = road_gain(direction, speed_mps)
+        walks = observer_noise(observer_pace)
     numbers = (
         direction,
         speed_mps,
         PREVIEW_S * speed_mps,
         *pid_gains(pid_pace),
         offset,
-        *with_yaw_rate.reshape(-1),
         road,
-        *without.reshape(-1),
+        *walks,
     )
     return Row._make(float(number) for number in numbers)
 
@@ -370,7 +309,7 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
     cars = corners(vehicle, softest_tyres=True)
     checked = checked_speeds(vehicle)
     at = {speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked}
-    usual, *others = MODES[law]
+    usual, *others = MODES[law].values()
     paces: list[float] = []
     # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
     for speed in reversed(checked):
@@ -386,6 +325,8 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
     paces.reverse()
     observer_pace = OBSERVER_PACES[0]
     for mode in others:
+        if mode.with_yaw_rate:
+            continue
         observer_pace = next(
             (
                 tried
@@ -436,7 +377,7 @@ def _why_not(vehicle: Vehicle, law: str) -> str:
     speed = checked_speeds(vehicle)[-1]
     row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1])
     z = on_circle(frequencies(speed))
-    system = model.controller(row, nominal, MODES[law][0])
+    system = model.controller(row, nominal, MODES[law][law])
 
     def margin(car: model.Corner) -> float:
         if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed, vehicle.criteria):

@@ -17,11 +17,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from firmware_py.core import estimator, pid, predictor
+from firmware_py.core import estimator, kalman, pid, predictor
 from firmware_py.core.motion import QUEUE_LENGTH, lag_weights
 from firmware_py.core.schedule import gains_at
 from firmware_py.core.tables import CarTable, GainTable, LegTable
 from sim.data_files import Vehicle
+from tools.design.filter import settled
 
 Floats = npt.NDArray[np.float64]
 Complexes = npt.NDArray[np.complex128]
@@ -50,19 +51,10 @@ class Row(NamedTuple):
     ki: float
     kd: float
     l_o: float
-    l_ee: float
-    l_ep: float
-    l_pe: float
-    l_pp: float
-    l_be: float
-    l_bp: float
     l_dr: float
-    m_ee: float
-    m_ep: float
-    m_pe: float
-    m_pp: float
-    m_de: float
-    m_dp: float
+    w_e: float
+    w_p: float
+    w_d: float
 
 
 class Nominal(NamedTuple):
@@ -91,10 +83,14 @@ class Corner(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """How the controller runs: predicting or not (`pid+ff`), with a fresh yaw rate or without."""
+    """How the controller runs: predicting or not (`pid+ff`), with a fresh yaw rate or without, with whose poses.
+
+    `localisation` is a key of `tools.design.filter.LOCALISATIONS`.
+    """
 
     predicts: bool = True
     with_yaw_rate: bool = True
+    localisation: str = "white"
 
 
 class StateSpace(NamedTuple):
@@ -258,11 +254,18 @@ def nominal_car(nominal: Nominal) -> CarTable:
     )
 
 
+def filter_of(row: Row, mode: Mode) -> kalman.Filter:
+    """The estimator's filter as it is in the long run at the speed of a row."""
+    walks = (row.w_e, row.w_p, row.w_d)
+    return settled(row.direction, row.speed_mps, mode.with_yaw_rate, walks, mode.localisation)
+
+
 class _Cycle:
     """One cycle of the firmware's law on a straight leg at constant speed, as a function of flat numbers.
 
     State: place, yaw, road disturbance, steering offset, gyro's bias, road-wheel angle, modelled angle, last yaw rate,
-    the way gone of the last cycles (place, then yaw, relative to now), the commands sent, the integral.
+    the pose's slow noise (sideways, yaw), the way gone of the last cycles (place, then yaw, relative to now), the
+    commands sent, the integral.
     """
 
     def __init__(self, row: Row, nominal: Nominal, mode: Mode) -> None:
@@ -271,18 +274,19 @@ class _Cycle:
         self.mode = mode
         self.speed_mps = row.speed_mps
         table = GainTable((row.speed_mps, row.speed_mps + 1.0), 1, ((row[2:], row[2:]),) * 2)
-        self.gains = gains_at(table, 0, row.speed_mps, int(mode.with_yaw_rate))
+        self.gains = gains_at(table, 0, row.speed_mps)
+        self.filter = filter_of(row, mode)
         self.memory = nominal.pose_latency_samples if mode.predicts else 0
         self.sent = nominal.command_latency_samples + 2
-        self.size = 8 + 2 * self.memory + self.sent + 1
+        self.size = 10 + 2 * self.memory + self.sent + 1
 
     def __call__(self, state: Floats, report: Floats) -> tuple[Floats, float]:
         """Next state and command (rad) from a state and a report, `OUTPUTS` numbers."""
         leg, car, sigma = self.leg, self.car, self.leg.sigma
         ds_m = self.speed_mps * PERIOD_S
         n = self.memory
-        y, yaw, road, offset, bias, angle, modelled, yaw_rate = (float(v) for v in state[:8])
-        rest = [float(v) for v in state[8:]]
+        y, yaw, road, offset, bias, angle, modelled, yaw_rate, slow_y, slow_yaw = (float(v) for v in state[:10])
+        rest = [float(v) for v in state[10:]]
         way_y, way_yaw, sent, integral = rest[:n], rest[n : 2 * n], rest[2 * n : -1], rest[-1]
         way = estimator.ODOMETRY_LENGTH
         believed = estimator.begin()._replace(
@@ -298,6 +302,9 @@ class _Cycle:
             yaw_rate_radps=yaw_rate,
             odometry_y_m=(0.0, *way_y, *(0.0,) * (way - 1 - n)),
             odometry_yaw_rad=(0.0, *way_yaw, *(0.0,) * (way - 1 - n)),
+            slow_cross_m=slow_y,
+            slow_heading_rad=slow_yaw,
+            filter=self.filter,
         )
         # The command that acts between two reports, as the controller has it.
         oldest = len(sent) - 1
@@ -317,6 +324,8 @@ class _Cycle:
             float(report[0]),
             float(report[1]),
             n,
+            0.0,
+            int(self.mode.predicts),
         )
         assert seen.disbelieved == 0
         queue = (*sent, *(0.0,) * (QUEUE_LENGTH - len(sent)))
@@ -340,6 +349,8 @@ class _Cycle:
             seen.road_wheel_angle_rad,
             seen.modelled_angle_rad,
             seen.yaw_rate_radps,
+            seen.slow_cross_m,
+            seen.slow_heading_rad,
             *(odometry_y[i] - odometry_y[0] for i in range(1, n + 1)),
             *(odometry_yaw[i] - odometry_yaw[0] for i in range(1, n + 1)),
             command,

@@ -21,7 +21,7 @@ from tools.design.gains import design_gains
 from tools.design.optimise import PathDesign, max_road_wheel_slope, optimise_path
 from tools.design.speed_profile import GRAVITY_MPS2, SpeedLimits, SpeedProfile, plan_speed, road_wheel_slope
 
-FORMAT = 1
+FORMAT = 2
 ROOT = Path(__file__).resolve().parent.parent.parent
 DBC_FOLDER = ROOT / "dbc"
 SHIPPED_FOLDER = ROOT / "firmware_py" / "tables"
@@ -38,6 +38,7 @@ SOURCES = (
     "search",
     "optimise",
     "speed_profile",
+    "filter",
     "model",
     "gains",
     "tables",
