@@ -59,6 +59,7 @@ class FirmwareLaw:
         self.state = estimator.begin()._replace(
             x_m=self.x_m,
             station_m=100.0,
+            cycles=0,
             noise=self.localisation.noise,
             filter=model.filter_of(row, mode),
         )
