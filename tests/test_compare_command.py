@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,19 @@ def test_a_claim_that_does_not_hold_is_said_not_to() -> None:
         }
     )
     assert [(verdict.best_other, verdict.holds) for verdict in judged] == [("lqr", False), ("lqr", True)]
+
+
+def test_beside_a_verdict_stands_the_mean_difference_of_a_run_with_its_error() -> None:
+    def runs(*errors_m: float) -> list[RunFigures]:
+        legs = [LegFigures(error_m, error_m**2, 1.0, 0.0, 0.0, 0.3, 0.0) for error_m in errors_m]
+        return [RunFigures((leg, leg._replace(max_cross_track_m=0.0)), True) for leg in legs]
+
+    own, other = runs(0.003, 0.001, 0.001, 0.001), runs(0.002, 0.002, 0.002, 0.001)
+    (verdict,) = command.verdicts({("car", "car", "estimator"): own, ("car", "lqr", "estimator"): other})
+    assert not verdict.holds
+    assert verdict.mean_difference_m == pytest.approx(-0.25e-3)
+    assert verdict.standard_error_m == pytest.approx(1e-3 * math.sqrt((1.25**2 + 2 * 0.75**2 + 0.25**2) / 3 / 4))
+    assert (verdict.smaller_in, verdict.runs) == (2, 4)
 
 
 @pytest.mark.parametrize(

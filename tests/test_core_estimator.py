@@ -27,6 +27,7 @@ class Drive:
         self.alignment_rad = car.get("alignment_rad", 0.0)
         self.gyro_bias_radps = car.get("gyro_bias_radps", 0.0)
         self.odometry_scale = car.get("odometry_scale", 1.0)
+        self.slip_scale = car.get("slip_scale", 1.0)
         self.noise = car.get("noise", 0.0)
         self.stated_m = car.get("stated_m", 0.01)
         self.rng = random.Random(1)
@@ -50,25 +51,30 @@ class Drive:
 
     def filter(self):
         """The filter of a car that has stood long and begins to drive."""
-        known = kalman.begin()._replace(covariance=kalman.averaged(300, NOISE.position_m2, NOISE.yaw_rad2, 0.0, 0.0))
+        known = kalman.begin()._replace(
+            covariance=kalman.averaged(300, NOISE.position_m2, NOISE.yaw_rad2, 0.0, 0.0, 0.25)
+        )
         body_m = self.leg.sigma * self.speed_mps * PERIOD_S * kalman.GAINS_EVERY
-        interval = kalman.Interval(body_m, 0, 0.01, estimator.MOVING_PRIOR, estimator.MOVING_PRIOR, 0, 1)
+        interval = kalman.Interval(body_m, 0.0, 0, 0.01, estimator.MOVING_PRIOR, estimator.MOVING_PRIOR, 0, 1)
         return kalman.advance(known, WALKS, NOISE, interval)
 
     def pose(self):
         """The car's pose on the path, body turned by its slip."""
         x_m, y_m, yaw_rad, slip_rad, _ = pose_at(self.leg, self.station_m)
-        return x_m, y_m, yaw_rad + slip_rad
+        return x_m, y_m, yaw_rad + self.slip_scale * slip_rad
 
     def curvature(self):
         """Curvature that the wheels must make, by difference of the body's yaw."""
         h = 0.005
-        yaw = [pose_at(self.leg, self.station_m + d)[2] + pose_at(self.leg, self.station_m + d)[3] for d in (-h, h)]
+        at = [pose_at(self.leg, self.station_m + d) for d in (-h, h)]
+        yaw = [yaw_rad + self.slip_scale * slip_rad for _, _, yaw_rad, slip_rad, _ in at]
         return self.leg.sigma * (yaw[1] - yaw[0]) / (2 * h)
 
     def wheels_rad(self):
         """Angle at which the wheels must stand for it, tyre slip included."""
-        return math.atan(self.car.wheelbase_m * (self.curvature() + pose_at(self.leg, self.station_m)[4]))
+        return math.atan(
+            self.car.wheelbase_m * (self.curvature() + self.slip_scale * pose_at(self.leg, self.station_m)[4])
+        )
 
     def cycles(self, count, with_yaw_rate=1, with_angle=1, with_pose=1, offset_m=0.0):
         for _ in range(count):
@@ -274,3 +280,19 @@ def test_a_pose_beyond_the_gate_is_not_believed_and_counted():
     assert outside.disbelieved == 1
     assert abs(outside.cross_track_error_m) < 0.01
     assert drive.cycles(1).disbelieved == 0
+
+
+@pytest.mark.parametrize("direction", [FORWARD, REVERSE])
+@pytest.mark.parametrize("slip_scale", [0.4, 1.9])
+def test_the_rear_tyres_slip_is_learnt_from_where_the_poses_lie(direction, slip_scale):
+    """Within a leg most of it; and the heading error is then that against the body of a car that slips so."""
+    drive = Drive(direction, slip_scale=slip_scale)
+    state = drive.cycles(1200)
+    assert abs(state.slip_scale - slip_scale) < 0.5 * abs(1.0 - slip_scale)
+    assert abs(state.cross_track_error_m) < 0.7e-3
+    assert abs(state.heading_error_rad) < 0.3e-3
+
+
+def test_a_slip_that_no_car_has_is_not_learnt():
+    assert Drive(slip_scale=12.0).cycles(1200).slip_scale == estimator.SLIP_SCALE_MAX
+    assert Drive(slip_scale=-10.0).cycles(1200).slip_scale == 0.0

@@ -223,7 +223,7 @@ def test_in_reverse_only_the_road_gain_changes_its_sign():
 def test_gains_are_smooth_over_speed(law, direction):
     rows = rows_of(designed("paper", "slow-rack")[law], direction)
     for low, high in pairwise(rows[1:]):
-        assert (low.kp, low.ki, low.kd) == pytest.approx(design.pid_gains(math.sqrt(low.kp / 3.0)))
+        assert (low.kp, low.ki, low.kd) == pytest.approx(design.pid_gains(law, math.sqrt(low.kp / 3.0)))
         for name in design.COLUMNS[5:]:  # kp and ki are powers of the pace, and kd is as the pace up to its greatest
             a, b = getattr(low, name), getattr(high, name)
             share = 0.35 if name == "kd" else 0.62
@@ -255,7 +255,7 @@ def test_the_choice_is_the_fastest_that_keeps_the_margin_and_the_next_faster_doe
     z = design.on_circle(design.frequencies(1.0))
 
     def least(pace):
-        kp, ki, kd = design.pid_gains(pace)
+        kp, ki, kd = design.pid_gains("car", pace)
         faster = row._replace(kp=kp, ki=ki, kd=kd)
         return design.disk_margin(model.loop_response(model.controller(faster, nominal), faster, cars, z)).min()
 

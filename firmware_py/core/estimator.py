@@ -8,12 +8,13 @@ It is the disturbance observer of the law. Its states live at the instant of the
   tyres), which the yaw rate shows at once;
 - the steering's gain and offset: how the measured wheels differ from the nominal actuator's, learnt slowly and the gain
   where the wheels hardly turn, so that an actuator with another lag is not taken for one with another gain;
-- the odometry's scale, learnt from what the poses find along the path.
+- the odometry's scale, learnt from what the poses find along the path;
+- the rear tyres' slip, as a multiple of the nominal car's, learnt from what the poses find across it.
 
 A pose report is old when it comes; it is carried to now by the way that odometry has gone since. Without a fresh yaw
 rate the heading is carried by the steering and the road disturbance, which the poses then correct; without a fresh
-angle the nominal actuator's stands in for the measured one. How much a pose corrects place, heading and bias (or road
-disturbance) is the Kalman filter's (`firmware_py.core.kalman`); the rest comes from the gain table.
+angle the nominal actuator's stands in for the measured one. How much a pose corrects place, heading, slip and bias (or
+road disturbance) is the Kalman filter's (`firmware_py.core.kalman`); the rest comes from the gain table.
 """
 
 import math
@@ -69,6 +70,7 @@ STEERING_OFFSET_MAX_RAD = 0.03
 ROAD_DISTURBANCE_MAX_RAD = 0.08
 ODOMETRY_SCALE_MAX = 0.05
 GYRO_BIAS_MAX_RADPS = 0.02
+SLIP_SCALE_MAX = 3.0
 """What may be learnt: several times what a car that is fit to drive shows."""
 
 
@@ -79,8 +81,8 @@ class EstimatorState(NamedTuple):
     answer to the commands, `yaw_rate_radps` the last one used. `averaged` counts the poses since the car stands at one
     place, `bias_averaged` the yaw rates, `disbelieved` the poses refused in a row. `odometry_*` is the way gone, newest
     first. `slow_*` is the part of the poses' noise that stays for seconds, as the newest pose had it. `cycles`,
-    `poses`, `yaw_rates` and `body_m` are those since the filter's gains were made: how many, how many believed, how
-    many fresh, and the way along the body.
+    `poses`, `yaw_rates`, `body_m` and `slipped_m` are those since the filter's gains were made: how many, how many
+    believed, how many fresh, the way along the body, and how far the nominal car's slip took it to the right.
     """
 
     x_m: float
@@ -94,6 +96,7 @@ class EstimatorState(NamedTuple):
     steering_offset_rad: float
     gyro_bias_radps: float
     odometry_scale: float
+    slip_scale: float
     road_wheel_angle_rad: float
     modelled_angle_rad: float
     yaw_rate_radps: float
@@ -109,6 +112,7 @@ class EstimatorState(NamedTuple):
     poses: int
     yaw_rates: int
     body_m: float
+    slipped_m: float
     noise: kalman.SeenNoise
     filter: kalman.Filter
 
@@ -147,6 +151,7 @@ def begin() -> EstimatorState:
         steering_offset_rad=0.0,
         gyro_bias_radps=0.0,
         odometry_scale=1.0,
+        slip_scale=1.0,
         road_wheel_angle_rad=0.0,
         modelled_angle_rad=0.0,
         yaw_rate_radps=0.0,
@@ -162,6 +167,7 @@ def begin() -> EstimatorState:
         poses=0,
         yaw_rates=0,
         body_m=0.0,
+        slipped_m=0.0,
         noise=kalman.begin_noise(),
         filter=kalman.begin(),
     )
@@ -199,6 +205,7 @@ def estimate(
         offset_rad,
         bias_radps,
         scale,
+        slip_scale,
         angle_rad,
         modelled_rad,
         last_yaw_rate_radps,
@@ -214,6 +221,7 @@ def estimate(
         poses,
         yaw_rates,
         gone_m,
+        slipped_m,
         noise,
         known,
     ) = state
@@ -246,7 +254,9 @@ def estimate(
 
     # The path at the station that odometry has come to.
     station_m += ds_m
-    path_x_m, path_y_m, path_yaw_rad, slip_rad, slip_1pm = pose_at(leg, station_m)
+    path_x_m, path_y_m, path_yaw_rad, nominal_slip_rad, slip_1pm = pose_at(leg, station_m)
+    slip_rad = slip_scale * nominal_slip_rad
+    slip_1pm *= slip_scale
     cos_path = math.cos(path_yaw_rad)
     sin_path = math.sin(path_yaw_rad)
 
@@ -342,7 +352,7 @@ def estimate(
         else:
             disbelieved += 1
         if taken != 0:
-            ee, ep, pe, pp, xe, xp, se, sp, te, tp = known.gains
+            ee, ep, pe, pp, xe, xp, ce, cp, se, sp, te, tp = known.gains
             cross_gap_m = bounded(new_cross_m - slow_cross_m, -known.most_cross_m, known.most_cross_m)
             heading_gap_rad = new_heading_rad - slow_heading_rad
             heading_gap_rad = bounded(heading_gap_rad, -known.most_heading_rad, known.most_heading_rad)
@@ -351,6 +361,8 @@ def estimate(
             # What is beyond the usual is a jump of the localisation, and not of the car.
             slow_cross_m = new_cross_m - cross_gap_m + se * cross_gap_m + sp * heading_gap_rad
             slow_heading_rad = new_heading_rad - heading_gap_rad + te * cross_gap_m + tp * heading_gap_rad
+            slip_scale += ce * cross_gap_m + cp * heading_gap_rad
+            slip_scale = bounded(slip_scale, 0.0, SLIP_SCALE_MAX)
             if known.with_yaw_rate == yaw_rate_is_fresh:
                 learnt = xe * cross_gap_m + xp * heading_gap_rad
                 if yaw_rate_is_fresh != 0:
@@ -374,12 +386,13 @@ def estimate(
     cycles += 1
     yaw_rates += yaw_rate_is_fresh
     gone_m += body_m
+    slipped_m += body_m * nominal_slip_rad
     if cycles >= kalman.GAINS_EVERY:
         with_yaw_rate = 1 if 2 * yaw_rates >= cycles else 0
         if filters != 0:
             walks = kalman.Walks(gains.cross_walk, gains.heading_walk, gains.road_walk)
             interval = kalman.Interval(
-                gone_m, poses, stated_sigma_m, averaged, bias_averaged, standstill, with_yaw_rate
+                gone_m, slipped_m, poses, stated_sigma_m, averaged, bias_averaged, standstill, with_yaw_rate
             )
             known = kalman.advance(known, walks, noise, interval)
         elif averaged > 0:
@@ -388,6 +401,7 @@ def estimate(
         poses = 0
         yaw_rates = 0
         gone_m = 0.0
+        slipped_m = 0.0
 
     return EstimatorState(
         x_m,
@@ -401,6 +415,7 @@ def estimate(
         offset_rad,
         bias_radps,
         scale,
+        slip_scale,
         angle_rad,
         modelled_rad,
         last_yaw_rate_radps,
@@ -416,6 +431,7 @@ def estimate(
         poses,
         yaw_rates,
         gone_m,
+        slipped_m,
         noise,
         known,
     )
@@ -435,6 +451,7 @@ def turn_round(leg: LegTable, state: EstimatorState) -> EstimatorState:
         state.steering_offset_rad,
         state.gyro_bias_radps,
         state.odometry_scale,
+        state.slip_scale,
         state.road_wheel_angle_rad,
         state.modelled_angle_rad,
         state.yaw_rate_radps,
@@ -450,6 +467,7 @@ def turn_round(leg: LegTable, state: EstimatorState) -> EstimatorState:
         state.poses,
         state.yaw_rates,
         state.body_m,
+        state.slipped_m,
         state.noise,
         state.filter,
     )

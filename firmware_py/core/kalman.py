@@ -1,9 +1,10 @@
 """The Kalman filter behind the estimator: how well the car's place is known, and how much a pose therefore corrects.
 
-Five errors are carried: of the cross-track error (e, m), of the heading (p, rad), of what carries the heading wrong
-(x: the gyro's bias in rad/s with the yaw rate, else the road disturbance in 1/m), and two of the pose itself: the part
-of its noise that stays for seconds, sideways (s, m) and in yaw (t, rad). Names put two of these letters together: `ep`
-is the covariance of e and p, or the gain that corrects e by a new heading.
+Six errors are carried: of the cross-track error (e, m), of the heading (p, rad), of what carries the heading wrong
+(x: the gyro's bias in rad/s with the yaw rate, else the road disturbance in 1/m), of how much the rear tyres slip (c, a
+share of the nominal car's slip), and two of the pose itself: the part of its noise that stays for seconds, sideways
+(s, m) and in yaw (t, rad). Names put two of these letters together: `ep` is the covariance of e and p, or the gain that
+corrects e by a new heading.
 
 What differs from one pose to the next averages out; how large it is, the poses of a car that stands show. The rest of
 the standard deviation that the localisation states for itself is taken to stay for seconds: a first-order process of
@@ -53,7 +54,11 @@ SLOW_NOISE_M = 0.002
 """Slow noise of the position from which on it is worth to wait for it at standstill (`manoeuvre`)."""
 
 SIDE_SLIP = 0.25e-3
-"""With the yaw rate: what the rear tyres' unknown slip moves the car aside, m per root metre of travel."""
+"""With the yaw rate: what else than their slip moves the car aside, m per root metre of travel."""
+
+SLIP_UNKNOWN = 0.5
+"""Standard deviation of the rear tyres' slip before any pose of a moving car has told of it, as a share of the nominal
+car's: a mass and a stiffness that are each 30 % off make it nearly twice, or half as much."""
 
 HEADING_WALK = 0.2e-3
 """With the yaw rate: what is left of heading that it does not show, rad per root metre."""
@@ -94,27 +99,33 @@ UNKNOWN_RAD = 0.1
 
 
 class Covariance(NamedTuple):
-    """Covariance of the five errors, symmetric."""
+    """Covariance of the six errors, symmetric."""
 
     ee: float
     ep: float
     ex: float
+    ec: float
     es: float
     et: float
     pp: float
     px: float
+    pc: float
     ps: float
     pt: float
     xx: float
+    xc: float
     xs: float
     xt: float
+    cc: float
+    cs: float
+    ct: float
     ss: float
     st: float
     tt: float
 
 
 class PoseGains(NamedTuple):
-    """What each of the five takes of the innovation in cross-track error (e) and heading (p), a pose."""
+    """What each of the six takes of the innovation in cross-track error (e) and heading (p), a pose."""
 
     ee: float
     ep: float
@@ -122,6 +133,8 @@ class PoseGains(NamedTuple):
     pp: float
     xe: float
     xp: float
+    ce: float
+    cp: float
     se: float
     sp: float
     te: float
@@ -170,13 +183,14 @@ class Filter(NamedTuple):
 class Interval(NamedTuple):
     """`GAINS_EVERY` cycles.
 
-    `body_m` is the way along the body (negative in reverse), `poses` how many were believed, `stated_m` the standard
-    deviation that the localisation states for a position (0: it does not know), `averaged` how many poses a standing
-    car's place is the average of, `bias_averaged` how many yaw rates the gyro's bias is; `standstill` is 1 for a car
-    that stands.
+    `body_m` is the way along the body (negative in reverse), `slipped_m` how far the nominal car's slip took it to the
+    right on it, `poses` how many were believed, `stated_m` the standard deviation that the localisation states for a
+    position (0: it does not know), `averaged` how many poses a standing car's place is the average of, `bias_averaged`
+    how many yaw rates the gyro's bias is; `standstill` is 1 for a car that stands.
     """
 
     body_m: float
+    slipped_m: float
     poses: int
     stated_m: float
     averaged: int
@@ -193,6 +207,7 @@ def begin() -> Filter:
         0.0,
         0.0,
         0.0,
+        0.0,
         UNKNOWN_RAD * UNKNOWN_RAD,
         0.0,
         0.0,
@@ -202,9 +217,14 @@ def begin() -> Filter:
         0.0,
         0.0,
         0.0,
+        SLIP_UNKNOWN * SLIP_UNKNOWN,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
         0.0,
     )
-    gains = PoseGains(1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    gains = PoseGains(1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return Filter(covariance, gains, MOST_SIGMAS * UNKNOWN_M, MOST_SIGMAS * UNKNOWN_RAD, 0.0, ROAD_UNKNOWN_1PM**2, 1)
 
 
@@ -251,10 +271,16 @@ def split(seen: SeenNoise, stated_m: float) -> tuple[float, float, float, float]
     )
 
 
-def averaged(poses: int, position_m2: float, yaw_rad2: float, slow_m2: float, slow_rad2: float) -> Covariance:
-    """Return the covariance of an average of so many poses, short against `SLOW_S`: the slow noise is wholly in it."""
+def averaged(
+    poses: int, position_m2: float, yaw_rad2: float, slow_m2: float, slow_rad2: float, slip2: float
+) -> Covariance:
+    """Return the covariance of an average of so many poses, short against `SLOW_S`: the slow noise is wholly in it.
+
+    `slip2` is the variance of the tyres' slip, of which a standing car tells nothing.
+    """
     return Covariance(
         slow_m2 + position_m2 / poses,
+        0.0,
         0.0,
         0.0,
         -slow_m2,
@@ -262,8 +288,13 @@ def averaged(poses: int, position_m2: float, yaw_rad2: float, slow_m2: float, sl
         slow_rad2 + yaw_rad2 / poses,
         0.0,
         0.0,
+        0.0,
         -slow_rad2,
         0.0,
+        0.0,
+        0.0,
+        0.0,
+        slip2,
         0.0,
         0.0,
         slow_m2,
@@ -275,14 +306,18 @@ def averaged(poses: int, position_m2: float, yaw_rad2: float, slow_m2: float, sl
 def predict(
     before: Covariance,
     body_m: float,
+    slipped_m: float,
     standstill: int,
     walks: Walks,
     with_yaw_rate: int,
     slow_m2: float,
     slow_rad2: float,
 ) -> Covariance:
-    """Return the covariance half of `GAINS_EVERY` cycles later, after a way along the body (m)."""
-    ee, ep, ex, es, et, pp, px, ps, pt, xx, xs, xt, ss, st, tt = before
+    """Return the covariance half of `GAINS_EVERY` cycles later, after a way along the body (m).
+
+    `slipped_m`: to the right, by the nominal car's slip.
+    """
+    ee, ep, ex, ec, es, et, pp, px, pc, ps, pt, xx, xc, xs, xt, cc, cs, ct, ss, st, tt = before
     way_m = abs(body_m)
     if standstill != 0:
         turn = 0.0
@@ -300,45 +335,66 @@ def predict(
         cross_m2 = walks.cross * walks.cross * way_m
         heading_rad2 = walks.heading * walks.heading * way_m
         other = walks.road * walks.road * way_m
-    # e += body_m p + aside x, p += turn x.
+    # e += body_m p + aside x - slipped_m c, p += turn x.
     aside = 0.5 * body_m * turn
-    px_after = px + turn * xx
     kept = KEPT_HALF
     left = 1.0 - kept * kept
-    cross_m2 += body_m * body_m * pp + aside * (2.0 * body_m * px + aside * xx)
+    # What e comes to, with each of the others as it was before.
+    e_p = ep + body_m * pp + aside * px - slipped_m * pc
+    e_x = ex + body_m * px + aside * xx - slipped_m * xc
+    e_c = ec + body_m * pc + aside * xc - slipped_m * cc
+    px_after = px + turn * xx
     return Covariance(
-        ee + 2.0 * (body_m * ep + aside * ex) + cross_m2,
-        ep + turn * ex + body_m * (pp + turn * px) + aside * px_after + 0.5 * body_m * heading_rad2,
-        ex + body_m * px + aside * xx,
-        kept * (es + body_m * ps + aside * xs),
-        kept * (et + body_m * pt + aside * xt),
+        ee + body_m * (ep + e_p) + aside * (ex + e_x) - slipped_m * (ec + e_c) + cross_m2,
+        e_p + turn * e_x + 0.5 * body_m * heading_rad2,
+        e_x,
+        e_c,
+        kept * (es + body_m * ps + aside * xs - slipped_m * cs),
+        kept * (et + body_m * pt + aside * xt - slipped_m * ct),
         pp + turn * (px + px_after) + heading_rad2,
         px_after + 0.5 * turn * other,
+        pc + turn * xc,
         kept * (ps + turn * xs),
         kept * (pt + turn * xt),
         xx + other,
+        xc,
         kept * xs,
         kept * xt,
+        cc,
+        kept * cs,
+        kept * ct,
         kept * kept * ss + left * slow_m2,
         kept * kept * st,
         kept * kept * tt + left * slow_rad2,
     )
 
 
+def _shown(
+    known: Covariance,
+) -> tuple[float, float, float, float, float, float, float, float, float, float, float, float]:
+    """Return the columns of P H', what a pose shows of each error: by its cross-track error e + s, its heading p + t.
+
+    First the six of the one, then of the other.
+    """
+    return (
+        known.ee + known.es,
+        known.ep + known.ps,
+        known.ex + known.xs,
+        known.ec + known.cs,
+        known.es + known.ss,
+        known.et + known.st,
+        known.ep + known.et,
+        known.pp + known.pt,
+        known.px + known.xt,
+        known.pc + known.ct,
+        known.ps + known.st,
+        known.pt + known.tt,
+    )
+
+
 def gains_of(before: Covariance, position_m2: float, yaw_rad2: float) -> PoseGains:
     """Return the gains for a pose of which so much (variances) averages out: P H' (H P H' + R)^-1."""
-    ee, ep, ex, es, et, pp, px, ps, pt, _, xs, xt, ss, st, tt = before
-    # Columns of P H': a pose shows e + s and p + t.
-    e_e = ee + es
-    p_e = ep + ps
-    x_e = ex + xs
-    s_e = es + ss
-    t_e = et + st
-    e_p = ep + et
-    p_p = pp + pt
-    x_p = px + xt
-    s_p = ps + st
-    t_p = pt + tt
+    e_e, p_e, x_e, c_e, s_e, t_e, e_p, p_p, x_p, c_p, s_p, t_p = _shown(before)
     # The inverse of H P H' + R, in which e + s is the first.
     cross_m2 = e_e + s_e + position_m2
     heading_rad2 = p_p + t_p + yaw_rad2
@@ -354,6 +410,8 @@ def gains_of(before: Covariance, position_m2: float, yaw_rad2: float) -> PoseGai
         b * p_e + c * p_p,
         a * x_e + b * x_p,
         b * x_e + c * x_p,
+        a * c_e + b * c_p,
+        b * c_e + c * c_p,
         a * s_e + b * s_p,
         b * s_e + c * s_p,
         a * t_e + b * t_p,
@@ -363,30 +421,28 @@ def gains_of(before: Covariance, position_m2: float, yaw_rad2: float) -> PoseGai
 
 def correct(before: Covariance, gains: PoseGains) -> Covariance:
     """Return the covariance after a pose, taken with the gains that are best for it: P - K H P."""
-    ee, ep, ex, es, et, pp, px, ps, pt, xx, xs, xt, ss, st, tt = before
-    g_ee, g_ep, g_pe, g_pp, g_xe, g_xp, g_se, g_sp, g_te, g_tp = gains
-    p_e = ep + ps
-    x_e = ex + xs
-    s_e = es + ss
-    t_e = et + st
-    e_p = ep + et
-    p_p = pp + pt
-    x_p = px + xt
-    s_p = ps + st
-    t_p = pt + tt
+    ee, ep, ex, ec, es, et, pp, px, pc, ps, pt, xx, xc, xs, xt, cc, cs, ct, ss, st, tt = before
+    g_ee, g_ep, g_pe, g_pp, g_xe, g_xp, g_ce, g_cp, g_se, g_sp, g_te, g_tp = gains
+    e_e, p_e, x_e, c_e, s_e, t_e, e_p, p_p, x_p, c_p, s_p, t_p = _shown(before)
     return Covariance(
-        ee - g_ee * (ee + es) - g_ep * e_p,
+        ee - g_ee * e_e - g_ep * e_p,
         ep - g_ee * p_e - g_ep * p_p,
         ex - g_ee * x_e - g_ep * x_p,
+        ec - g_ee * c_e - g_ep * c_p,
         es - g_ee * s_e - g_ep * s_p,
         et - g_ee * t_e - g_ep * t_p,
         pp - g_pe * p_e - g_pp * p_p,
         px - g_pe * x_e - g_pp * x_p,
+        pc - g_pe * c_e - g_pp * c_p,
         ps - g_pe * s_e - g_pp * s_p,
         pt - g_pe * t_e - g_pp * t_p,
         xx - g_xe * x_e - g_xp * x_p,
+        xc - g_xe * c_e - g_xp * c_p,
         xs - g_xe * s_e - g_xp * s_p,
         xt - g_xe * t_e - g_xp * t_p,
+        cc - g_ce * c_e - g_cp * c_p,
+        cs - g_ce * s_e - g_cp * s_p,
+        ct - g_ce * t_e - g_cp * t_p,
         ss - g_se * s_e - g_sp * s_p,
         st - g_se * t_e - g_sp * t_p,
         tt - g_te * t_e - g_tp * t_p,
@@ -395,11 +451,11 @@ def correct(before: Covariance, gains: PoseGains) -> Covariance:
 
 def advance(state: Filter, walks: Walks, seen: SeenNoise, interval: Interval) -> Filter:
     """Return the filter after `GAINS_EVERY` cycles, with the gains for the next ones."""
-    body_m, poses, stated_m, count, bias_count, standstill, with_yaw_rate = interval
+    body_m, slipped_m, poses, stated_m, count, bias_count, standstill, with_yaw_rate = interval
     known = state.covariance
     position_m2, yaw_rad2, slow_m2, slow_rad2 = split(seen, stated_m)
     if standstill != 0 and 0 < count <= AVERAGED_POSES:
-        known = averaged(count, position_m2, yaw_rad2, slow_m2, slow_rad2)
+        known = averaged(count, position_m2, yaw_rad2, slow_m2, slow_rad2, known.cc)
     road_1pm2 = state.road_1pm2 if state.with_yaw_rate != 0 else known.xx
     if standstill != 0 or with_yaw_rate != state.with_yaw_rate:
         # At standstill the bias is the average that the estimator makes of it.
@@ -413,11 +469,12 @@ def advance(state: Filter, walks: Walks, seen: SeenNoise, interval: Interval) ->
         road_1pm2 = max(road_1pm2 / (1.0 + abs(body_m) / ROAD_LENGTH_M), ROAD_SEEN_1PM * ROAD_SEEN_1PM)
     if standstill == 0 or count > AVERAGED_POSES:
         half_m = body_m / 2
-        known = predict(known, half_m, standstill, walks, with_yaw_rate, slow_m2, slow_rad2)
+        slipped_half_m = slipped_m / 2
+        known = predict(known, half_m, slipped_half_m, standstill, walks, with_yaw_rate, slow_m2, slow_rad2)
         if poses > 0:
             # As many poses as came meanwhile, at once: their mean, in the middle of the way.
             known = correct(known, gains_of(known, position_m2 / poses, yaw_rad2 / poses))
-        known = predict(known, half_m, standstill, walks, with_yaw_rate, slow_m2, slow_rad2)
+        known = predict(known, half_m, slipped_half_m, standstill, walks, with_yaw_rate, slow_m2, slow_rad2)
     cross_m2 = UNKNOWN_M * UNKNOWN_M
     heading_rad2 = UNKNOWN_RAD * UNKNOWN_RAD
     if slow_m2 > position_m2:
@@ -437,7 +494,7 @@ def advance(state: Filter, walks: Walks, seen: SeenNoise, interval: Interval) ->
 def as_they_come(seen: SeenNoise, stated_m: float, poses: int) -> Filter:
     """Return the filter of a law that does not filter: as good as one pose, or as the average of a standing car's."""
     position_m2, yaw_rad2, slow_m2, slow_rad2 = split(seen, stated_m)
-    known = averaged(poses, position_m2, yaw_rad2, slow_m2, slow_rad2)
+    known = averaged(poses, position_m2, yaw_rad2, slow_m2, slow_rad2, SLIP_UNKNOWN * SLIP_UNKNOWN)
     _, gains, most_cross_m, most_heading_rad, _, road_1pm2, with_yaw_rate = begin()
     return Filter(known, gains, most_cross_m, most_heading_rad, slow_m2, road_1pm2, with_yaw_rate)
 
@@ -448,15 +505,21 @@ def _with_x(known: Covariance, variance: float) -> Covariance:
         known.ee,
         known.ep,
         0.0,
+        known.ec,
         known.es,
         known.et,
         known.pp,
         0.0,
+        known.pc,
         known.ps,
         known.pt,
         variance,
         0.0,
         0.0,
+        0.0,
+        known.cc,
+        known.cs,
+        known.ct,
         known.ss,
         known.st,
         known.tt,

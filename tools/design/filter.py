@@ -59,10 +59,11 @@ def settled(
     noise, stated_m = LOCALISATIONS[localisation]
     state = kalman.begin()._replace(with_yaw_rate=int(with_yaw_rate))
     if speed_mps == 0.0:
-        return state._replace(gains=kalman.PoseGains(*(0.0,) * 10))
+        return state._replace(gains=kalman.PoseGains(*(0.0,) * 12))
     every = kalman.GAINS_EVERY
     interval = kalman.Interval(
         body_m=direction * speed_mps * kalman.PERIOD_S * every,
+        slipped_m=0.0,
         poses=every,
         stated_m=stated_m,
         averaged=0,
