@@ -182,6 +182,6 @@ def trade(file: Path, *, points: Sequence[Mapping[str, Any]], title: str) -> Non
         axes.set_xlabel("clearance of the body on the path (m)")
         axes.grid(visible=True, alpha=0.3)
         axes.set_ylim(0.0, 1.12 * max(values))
-        axes.legend(fontsize=8, loc="lower left")
+        axes.legend(fontsize=8)
     figure.suptitle(title)
     _save(figure, file)
