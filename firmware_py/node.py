@@ -6,6 +6,8 @@ from firmware_py.codec import Codec, Mailbox, Sender
 from firmware_py.core import conditions as c
 from firmware_py.core import controller, kalman
 from firmware_py.core.health import PROTOCOL
+from firmware_py.core.manoeuvre import direction_of
+from firmware_py.core.path import pose_at
 from firmware_py.core.signals import (
     MODE_ACTIVE,
     MODE_FAULT,
@@ -186,7 +188,9 @@ class ControllerNode:
     def _estimate(self, inputs: Inputs) -> Estimate:
         """Return how sure the estimator is, and what it has learnt of the car."""
         seen = self._state.estimator
-        cross_m, heading_rad = kalman.deviations(seen.filter.covariance, inputs.attitude.position_sigma_m)
+        leg = self._tables.leg[direction_of(self._state.manoeuvre.leg)]
+        slip_rad = pose_at(leg, seen.station_m)[3]
+        cross_m, heading_rad = kalman.deviations(seen.filter.covariance, slip_rad, inputs.attitude.position_sigma_m)
         return Estimate(cross_m, heading_rad, seen.steering_gain, seen.steering_offset_rad, seen.odometry_scale)
 
     def _note(self, error: Exception) -> None:

@@ -81,7 +81,7 @@ def matrix_of(known):
 def any_covariance(seed):
     """One that is positive definite, with everything in it, in the sizes that occur."""
     rng = np.random.default_rng(seed)
-    root = rng.normal(size=(6, 6)) * np.array([[3e-3], [1e-3], [2e-3], [0.4], [8e-3], [1e-3]])
+    root = rng.normal(size=(6, 6)) * np.array([[3e-3], [1e-3], [2e-3], [0.1], [8e-3], [1e-3]])
     full = root @ root.T
     return kalman.Covariance(*(float(value) for value in full[np.triu_indices(6)]))
 
@@ -103,7 +103,8 @@ def test_a_prediction_is_the_textbooks(body_m, with_yaw_rate, standstill):
     if standstill:
         stood = kalman.STANDING_WALK_M**2 * half_s
         noises = (stood, kalman.YAW_PER_POSITION_RADPM**2 * stood, 0.0)
-    q = np.diag([*noises, 0.0, (1.0 - kept**2) * 1e-4, (1.0 - kept**2) * 3e-6])
+    slip2 = 0.0 if standstill else kalman.SLIP_WALK**2 * way_m
+    q = np.diag([*noises, slip2, (1.0 - kept**2) * 1e-4, (1.0 - kept**2) * 3e-6])
     # Half of what came to the heading on the way is in the place, as is half of what came to x in the heading.
     q[0, 1] = q[1, 0] = 0.5 * body_m * noises[1]
     q[1, 2] = q[2, 1] = 0.5 * turn * noises[2]
@@ -167,6 +168,7 @@ def test_it_is_the_covariance_of_many_cars_that_are_corrected_so(noise, sigma, w
             e_m += way_m * (p_rad + 0.5 * turn * x) - slipped_m * slip + rng.normal(0.0, side, cars)
             p_rad += turn * x + rng.normal(0.0, walk, cars)
             x += rng.normal(0.0, other, cars)
+            slip += rng.normal(0.0, kalman.SLIP_WALK * way_root, cars)
             s_m = kalman.KEPT * s_m + rng.normal(0.0, math.sqrt(left * slow_m2), cars)
             t_rad = kalman.KEPT * t_rad + rng.normal(0.0, math.sqrt(left * slow_rad2), cars)
             if cycle < poses:
@@ -191,7 +193,7 @@ def test_it_is_the_covariance_of_many_cars_that_are_corrected_so(noise, sigma, w
 
 def test_at_standstill_white_noise_falls_with_the_root_of_the_poses():
     for poses in (20, 50, 100, 200, 400):
-        cross_m, heading_rad = kalman.deviations(after_standing(WHITE, poses).covariance, 0.01)
+        cross_m, heading_rad = kalman.deviations(after_standing(WHITE, poses).covariance, 0.0, 0.01)
         # Besides, what nobody states: it is slow, and so a part of it stays.
         unstated_rad = kalman.YAW_PER_POSITION_RADPM * kalman.UNSTATED_M
         for sigma, white, unstated in (
@@ -201,7 +203,7 @@ def test_at_standstill_white_noise_falls_with_the_root_of_the_poses():
             # After the average it also takes the car to move a little.
             most = 1.02 if poses <= kalman.AVERAGED_POSES else 1.25
             assert white / math.sqrt(poses) < sigma < most * math.hypot(white / math.sqrt(poses), unstated)
-    forever = [kalman.deviations(after_standing(WHITE, poses).covariance, 0.01)[0] for poses in (3000, 6000)]
+    forever = [kalman.deviations(after_standing(WHITE, poses).covariance, 0.0, 0.01)[0] for poses in (3000, 6000)]
     assert forever[1] == pytest.approx(forever[0], rel=0.02)
     assert 0.01 / math.sqrt(400) < forever[0] < 0.01 / math.sqrt(150)
 
@@ -209,10 +211,42 @@ def test_at_standstill_white_noise_falls_with_the_root_of_the_poses():
 def test_at_standstill_slow_noise_falls_with_the_seconds():
     """As that of the best mean of a first-order process: by 2 over 2 and the time in units of its own."""
     for poses in (600, 1000, 2000):
-        cross_m, _ = kalman.deviations(after_standing(SLOW, poses).covariance, 0.01)
+        cross_m, _ = kalman.deviations(after_standing(SLOW, poses).covariance, 0.0, 0.01)
         seconds = (poses - kalman.AVERAGED_POSES) * kalman.PERIOD_S
         best_m = 0.01 * math.sqrt(2.0 / (2.0 + seconds / kalman.SLOW_S))
         assert best_m < cross_m < 1.04 * best_m  # it also takes the car to move a little
+
+
+def after_a_bend():
+    """The filter of a car that has driven 3 m with slip."""
+    state = after_standing(WHITE)
+    for _ in range(33):
+        state = kalman.advance(state, WALKS, WHITE, moving(slipped_m=3e-4))
+    return state
+
+
+def test_what_is_known_of_the_slip_stays_at_standstill_and_is_forgotten_with_the_way():
+    state = after_a_bend()
+    before = state.covariance
+    assert math.sqrt(before.cc) < 0.6 * kalman.SLIP_UNKNOWN
+    stood = kalman.advance(state, WALKS, WHITE, standing(300, 0)).covariance
+    assert (stood.cc, stood.ec, stood.pc) == (before.cc, before.ec, before.pc)
+    assert stood.xc == 0.0 != before.xc  # at standstill the bias is its own average
+    assert kalman.advance(state, WALKS, WHITE, standing(4, 4)).covariance.cc == before.cc
+    for _ in range(10):
+        state = kalman.advance(state, WALKS, WHITE, moving(0.1, 0))
+    assert state.covariance.cc == pytest.approx(before.cc + kalman.SLIP_WALK**2, rel=1e-9)
+    for _ in range(10_000):
+        state = kalman.advance(state, WALKS, WHITE, moving(0.1))
+    assert state.covariance.cc == pytest.approx(kalman.SLIP_UNKNOWN**2, rel=1e-9)
+
+
+def test_the_heading_error_is_as_sure_as_yaw_and_slip_together():
+    known = after_a_bend().covariance
+    against = np.array([0.0, 1.0, 0.0, -0.9e-3, 0.0, 0.0])
+    sigma_rad = math.sqrt(against @ matrix_of(known) @ against)
+    assert kalman.deviations(known, 0.9e-3, 0.01)[1] == pytest.approx(sigma_rad, rel=1e-9)
+    assert sigma_rad > 1.1 * math.sqrt(known.pp)
 
 
 def test_an_average_begun_anew_forgets_what_was_known():
@@ -348,7 +382,7 @@ def test_a_localisation_that_does_not_know_is_not_taken_for_a_perfect_one():
     noise = seen(3e-4, 5e-5)
     assert kalman.split(noise, 0.0) == pytest.approx((1e-4, 0.001745**2, 9e-8, 2.74e-9), rel=0.01)
     sure = after_standing(WHITE).covariance
-    assert kalman.deviations(sure, 0.0)[0] > kalman.UNKNOWN_SIGMA_M > 10.0 * kalman.deviations(sure, 0.01)[0]
+    assert kalman.deviations(sure, 0.0, 0.0)[0] > kalman.UNKNOWN_SIGMA_M > 10.0 * kalman.deviations(sure, 0.0, 0.01)[0]
 
 
 def test_only_poses_of_one_stay_are_compared_and_a_turn_past_pi_is_small():

@@ -70,8 +70,12 @@ STEERING_OFFSET_MAX_RAD = 0.03
 ROAD_DISTURBANCE_MAX_RAD = 0.08
 ODOMETRY_SCALE_MAX = 0.05
 GYRO_BIAS_MAX_RADPS = 0.02
-SLIP_SCALE_MAX = 3.0
 """What may be learnt: several times what a car that is fit to drive shows."""
+
+SLIP_SCALE_LEAST = 0.4
+SLIP_SCALE_MOST = 2.0
+"""What mass and tyres 30 % off make of the nominal car's slip, and no more: a localisation whose yaw is mounted askew
+looks like slip too, until the car has gone both ways."""
 
 
 class EstimatorState(NamedTuple):
@@ -256,7 +260,6 @@ def estimate(
     station_m += ds_m
     path_x_m, path_y_m, path_yaw_rad, nominal_slip_rad, slip_1pm = pose_at(leg, station_m)
     slip_rad = slip_scale * nominal_slip_rad
-    slip_1pm *= slip_scale
     cos_path = math.cos(path_yaw_rad)
     sin_path = math.sin(path_yaw_rad)
 
@@ -361,8 +364,10 @@ def estimate(
             # What is beyond the usual is a jump of the localisation, and not of the car.
             slow_cross_m = new_cross_m - cross_gap_m + se * cross_gap_m + sp * heading_gap_rad
             slow_heading_rad = new_heading_rad - heading_gap_rad + te * cross_gap_m + tp * heading_gap_rad
-            slip_scale += ce * cross_gap_m + cp * heading_gap_rad
-            slip_scale = bounded(slip_scale, 0.0, SLIP_SCALE_MAX)
+            if follows != 0:
+                # At the speed and in the bends that the path is planned with: else the slip is another one.
+                slip_scale += ce * cross_gap_m + cp * heading_gap_rad
+                slip_scale = bounded(slip_scale, SLIP_SCALE_LEAST, SLIP_SCALE_MOST)
             if known.with_yaw_rate == yaw_rate_is_fresh:
                 learnt = xe * cross_gap_m + xp * heading_gap_rad
                 if yaw_rate_is_fresh != 0:
@@ -386,7 +391,8 @@ def estimate(
     cycles += 1
     yaw_rates += yaw_rate_is_fresh
     gone_m += body_m
-    slipped_m += body_m * nominal_slip_rad
+    if follows != 0:
+        slipped_m += body_m * nominal_slip_rad
     if cycles >= kalman.GAINS_EVERY:
         with_yaw_rate = 1 if 2 * yaw_rates >= cycles else 0
         if filters != 0:

@@ -54,11 +54,16 @@ SLOW_NOISE_M = 0.002
 """Slow noise of the position from which on it is worth to wait for it at standstill (`manoeuvre`)."""
 
 SIDE_SLIP = 0.25e-3
-"""With the yaw rate: what else than their slip moves the car aside, m per root metre of travel."""
+"""With the yaw rate: what else moves the car aside, m per root metre of travel. Half as much would do in the scenarios;
+but a yaw mounted askew or an axle out of line, which no state stands for, are to be followed too."""
 
 SLIP_UNKNOWN = 0.5
 """Standard deviation of the rear tyres' slip before any pose of a moving car has told of it, as a share of the nominal
 car's: a mass and a stiffness that are each 30 % off make it nearly twice, or half as much."""
+
+SLIP_WALK = 0.03
+"""Change of that share per root metre of travel, up to what is unknown at first: passengers get in, a tyre loses air,
+and within a manoeuvre or two it is to be learnt anew."""
 
 HEADING_WALK = 0.2e-3
 """With the yaw rate: what is left of heading that it does not show, rad per root metre."""
@@ -324,18 +329,21 @@ def predict(
         cross_m2 = STANDING_WALK_M * STANDING_WALK_M * HALF_S
         heading_rad2 = YAW_PER_POSITION_RADPM * YAW_PER_POSITION_RADPM * cross_m2
         other = 0.0
+        slip2 = 0.0
     elif with_yaw_rate != 0:
         turn = -HALF_S
         cross_m2 = SIDE_SLIP * SIDE_SLIP * way_m
         heading_rad2 = HEADING_WALK * HEADING_WALK * way_m
         heading_rad2 += YAW_RATE_NOISE_RADPS * YAW_RATE_NOISE_RADPS * PERIOD_S * HALF_S
         other = YAW_RATE_WALK * YAW_RATE_WALK * HALF_S
+        slip2 = SLIP_WALK * SLIP_WALK * way_m
     else:
         turn = body_m
         cross_m2 = walks.cross * walks.cross * way_m
         heading_rad2 = walks.heading * walks.heading * way_m
         other = walks.road * walks.road * way_m
-    # e += body_m p + aside x - slipped_m c, p += turn x. Without the yaw rate c turns p too, by less than x does.
+        slip2 = SLIP_WALK * SLIP_WALK * way_m
+    # e += body_m p + aside x - slipped_m c, p += turn x.
     aside = 0.5 * body_m * turn
     kept = KEPT_HALF
     left = 1.0 - kept * kept
@@ -360,7 +368,7 @@ def predict(
         xc,
         kept * xs,
         kept * xt,
-        cc,
+        min(cc + slip2, max(cc, SLIP_UNKNOWN * SLIP_UNKNOWN)),
         kept * cs,
         kept * ct,
         kept * kept * ss + left * slow_m2,
@@ -526,13 +534,14 @@ def _with_x(known: Covariance, variance: float) -> Covariance:
     )
 
 
-def deviations(known: Covariance, stated_m: float) -> tuple[float, float]:
+def deviations(known: Covariance, nominal_slip_rad: float, stated_m: float) -> tuple[float, float]:
     """Return the standard deviations of cross-track (m) and heading error (rad) of the estimate.
 
-    Where the localisation states none of its own (`stated_m` 0), what it is assumed to have may be slow as well.
+    The heading error is that against the path and the slip there (`nominal_slip_rad`). Where the localisation states
+    none of its own (`stated_m` 0), what it is assumed to have may be slow as well.
     """
     cross_m2 = max(known.ee, 0.0)  # rounding may leave a variance a little below zero
-    heading_rad2 = max(known.pp, 0.0)
+    heading_rad2 = max(known.pp - nominal_slip_rad * (2.0 * known.pc - nominal_slip_rad * known.cc), 0.0)
     if stated_m <= 0.0:
         cross_m2 += UNKNOWN_SIGMA_M * UNKNOWN_SIGMA_M
         heading_rad2 += (YAW_PER_POSITION_RADPM * UNKNOWN_SIGMA_M) ** 2

@@ -63,7 +63,7 @@ def settled(
     every = kalman.GAINS_EVERY
     interval = kalman.Interval(
         body_m=direction * speed_mps * kalman.PERIOD_S * every,
-        slipped_m=0.0,
+        slipped_m=0.0,  # on the straight: what the bends teach of the tyres' slip is slow, and no part of the loop
         poses=every,
         stated_m=stated_m,
         averaged=0,

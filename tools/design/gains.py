@@ -99,7 +99,8 @@ GAIN_SPREAD = 0.1
 def pid_gains(law: str, pace: float) -> tuple[float, float, float]:
     """PID gains kp (1/m^2), ki (1/m^3), kd (1/m) whose poles per metre are those of (3, 0.8, 2.7) times the pace.
 
-    Less ki and kd where a law's are at their greatest.
+    With less ki and kd where they are at their greatest, as those of `car` mostly are: its slowest pole is then at
+    about KI_OVER_KP_MAX_1PM.
 
     Up to the pace at which kd comes to its greatest the two poles of the error, with the preview at full speed, fall
     together; a higher one makes the error smaller, and less damped. What pushes the car aside while it points along
