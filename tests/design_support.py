@@ -1,10 +1,11 @@
-"""What the design's tests share: the firmware's own functions on a straight leg, and a car behind its delay."""
+"""What the design's tests share: the firmware's own functions on straight and circle, and cars behind their delay."""
 
 import math
 from functools import cache
 
 from firmware_py.core import estimator, pid, predictor
 from firmware_py.core.motion import QUEUE_LENGTH
+from firmware_py.core.path import feedforward_curvature_1pm
 from firmware_py.core.schedule import gains_at
 from firmware_py.core.tables import GainTable
 from sim.data_files import load_scenario, load_vehicle
@@ -68,9 +69,9 @@ class FirmwareLaw:
 
     def command_rad(self, e_m, yaw_rad, yaw_rate_radps, angle_rad):
         """One cycle: what the reports say in, the road-wheel angle out."""
-        leg, car, sigma = self.leg, self.car, self.leg.sigma
+        car = self.car
         ds_m = self.speed_mps * PERIOD_S
-        self.x_m += sigma * ds_m
+        self.x_m += self.leg.sigma * ds_m
         self.poses_x.append(self.x_m)
         n = car.command_latency_samples
         acted = self.sent_rad[n] + car.late_weight * (self.sent_rad[n + 1] - self.sent_rad[n])
@@ -78,22 +79,30 @@ class FirmwareLaw:
             ds_m, PERIOD_S, acted, angle_rad, 1, yaw_rate_radps, int(self.mode.with_yaw_rate), 0, 1
         )
         latency = car.pose_latency_samples if self.mode.predicts else 0
-        pose_x_m = self.poses_x[-1 - latency]
+        return self.cycle(motion, self.poses_x[-1 - latency], e_m, yaw_rad)
+
+    def cycle(self, motion, pose_x_m, pose_y_m, yaw_rad):
+        """One cycle with a pose anywhere on the leg; the road-wheel angle out."""
+        leg, car, sigma = self.leg, self.car, self.leg.sigma
+        latency = car.pose_latency_samples if self.mode.predicts else 0
         stated_m, filters = self.localisation.stated_m, int(self.mode.predicts)
         self.state = estimator.estimate(
-            leg, car, self.gains, self.state, motion, 1, pose_x_m, e_m, yaw_rad, latency, stated_m, filters
+            leg, car, self.gains, self.state, motion, 1, pose_x_m, pose_y_m, yaw_rad, latency, stated_m, filters
         )  # fmt: skip
         assert self.state.disbelieved == 0
-        _, e, heading, wheels_rad = predictor.predict(leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S)
+        station_m, e, heading, wheels_rad = predictor.predict(
+            leg, car, self.state, self.sent_rad, self.speed_mps, PERIOD_S
+        )
         if not self.mode.predicts:
             e, heading = self.state.cross_track_error_m, self.state.heading_error_rad
         preview = pid.preview_error_m(e, heading, self.gains.preview_m, sigma)
         feedback = pid.feedback_1pm(preview, heading, self.integral_m2, self.gains, sigma)
-        angle = math.atan(-car.wheelbase_m * feedback) - self.state.road_disturbance_rad
+        reference = feedforward_curvature_1pm(leg, station_m)
+        angle = math.atan(car.wheelbase_m * (reference - feedback)) - self.state.road_disturbance_rad
         if self.mode.predicts:
             angle += pid.push_rad(angle - wheels_rad, car)
         angle = (angle - self.state.steering_offset_rad) / self.state.steering_gain
-        self.integral_m2 = pid.integrate_m2(self.integral_m2, preview, ds_m, self.gains, 0)
+        self.integral_m2 = pid.integrate_m2(self.integral_m2, preview, motion.odometry_m, self.gains, 0)
         self.sent_rad = (angle, *self.sent_rad[:-1])
         return angle
 
@@ -144,3 +153,73 @@ def drive(law: FirmwareLaw, road: StraightRoad, cycles):
             break
         road.drive(law.command_rad(*road.reports()))
     return errors
+
+
+class Bend:
+    """A law that drives a circle forward for good with the wheels at `angle_rad`, and its car, nothing linearised.
+
+    The car has no tyres and no latency of the pose. `late_samples` is what its command takes longer than known.
+    """
+
+    LENGTH_M, STEP_M = 70.0, 0.05
+
+    def __init__(self, row: Row, nominal: Nominal, mode: Mode, angle_rad, late_samples, e_m):
+        self.law = FirmwareLaw(row, nominal._replace(pose_latency_samples=0), mode)
+        self.nominal, self.speed_mps, self.angle_rad = nominal, row.speed_mps, angle_rad
+        self.curvature_1pm = math.tan(angle_rad) / nominal.wheelbase_m
+        count = round(self.LENGTH_M / self.STEP_M) + 1
+        yaws = [self.curvature_1pm * self.STEP_M * index for index in range(count)]
+        zero = (0.0,) * count
+        self.law.leg = straight_leg(1.0)._replace(
+            step_m=self.STEP_M,
+            length_m=self.LENGTH_M,
+            last_row=count - 1,
+            x_m=tuple(math.sin(yaw) / self.curvature_1pm for yaw in yaws),
+            y_m=tuple((1.0 - math.cos(yaw)) / self.curvature_1pm for yaw in yaws),
+            yaw_rad=tuple(yaws),
+            slip_heading_rad=zero,
+            slip_curvature_1pm=zero,
+            feedforward_curvature_1pm=(self.curvature_1pm,) * count,
+            feedforward_slope_1pm2=zero,
+            speed_mps=(self.speed_mps,) * count,
+            accel_mps2=zero,
+        )
+        self.law.sent_rad = (angle_rad,) * QUEUE_LENGTH
+        self.x_m, self.y_m, self.yaw_rad, self.rack_rad = 0.0, e_m, 0.0, angle_rad
+        self.law.state = self.law.state._replace(
+            x_m=0.0,
+            y_m=e_m,
+            station_m=0.0,
+            road_wheel_angle_rad=angle_rad,
+            modelled_angle_rad=angle_rad,
+            yaw_rate_radps=self.speed_mps * self.curvature_1pm,
+        )
+        dead = nominal.command_latency_samples + 0.4 + late_samples
+        self.line = [angle_rad] * round(dead * StraightRoad.STEPS)
+
+    def cross_track_errors_m(self, cycles):
+        """The errors of so many cycles, up to where they leave the believable."""
+        errors = []
+        law, h = self.law, PERIOD_S / StraightRoad.STEPS
+        answer = 1.0 - math.exp(-h / self.nominal.steering_lag_s)
+        for _ in range(cycles):
+            radius_m = 1.0 / self.curvature_1pm
+            errors.append(radius_m - math.hypot(self.x_m, self.y_m - radius_m))
+            if abs(errors[-1]) > 0.1 or abs(self.rack_rad - self.angle_rad) > 0.5:
+                break
+            n = law.car.command_latency_samples
+            acted = law.sent_rad[n] + law.car.late_weight * (law.sent_rad[n + 1] - law.sent_rad[n])
+            yaw_rate_radps = self.speed_mps * math.tan(self.rack_rad) / self.nominal.wheelbase_m
+            motion = estimator.Motion(
+                self.speed_mps * PERIOD_S, PERIOD_S, acted, self.rack_rad, 1, yaw_rate_radps, 1, 0, 1
+            )
+            command_rad = law.cycle(motion, self.x_m, self.y_m, self.yaw_rad)
+            self.line += [command_rad] * StraightRoad.STEPS
+            for target in self.line[: StraightRoad.STEPS]:
+                self.rack_rad += answer * (target - self.rack_rad)
+                turned = math.tan(self.rack_rad) / self.nominal.wheelbase_m * self.speed_mps * h
+                self.x_m += self.speed_mps * h * math.cos(self.yaw_rad + 0.5 * turned)
+                self.y_m += self.speed_mps * h * math.sin(self.yaw_rad + 0.5 * turned)
+                self.yaw_rad += turned
+            del self.line[: StraightRoad.STEPS]
+        return errors

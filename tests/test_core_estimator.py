@@ -24,6 +24,7 @@ class Drive:
         self.leg, self.car = self.tables.leg[direction], self.tables.car
         self.direction, self.speed_mps = direction, speed_mps
         self.steering_gain = car.get("steering_gain", 1.0)
+        self.extra_lag_s = car.get("extra_lag_s", 0.0)
         self.alignment_rad = car.get("alignment_rad", 0.0)
         self.gyro_bias_radps = car.get("gyro_bias_radps", 0.0)
         self.odometry_scale = car.get("odometry_scale", 1.0)
@@ -34,7 +35,7 @@ class Drive:
         self.station_m = 1.0
         self.poses = [self.pose()]
         x_m, y_m, yaw_rad = self.pose()
-        rack_rad = self.wheels_rad() - self.alignment_rad
+        rack_rad = self.rack_rad = self.wheels_rad() - self.alignment_rad
         self.state = estimator.begin()._replace(
             x_m=x_m,
             y_m=y_m,
@@ -83,9 +84,10 @@ class Drive:
             after = self.pose()
             self.poses.append(after)
             yaw_rate_radps = self.leg.sigma * self.speed_mps * self.curvature()
-            rack_rad = self.wheels_rad() - self.alignment_rad
+            last_rad, rack_rad = self.rack_rad, self.wheels_rad() - self.alignment_rad
+            self.rack_rad = rack_rad
             # The command that acts on the nominal actuator so that the wheels stand as they do.
-            modelled = rack_rad / self.steering_gain
+            modelled = (rack_rad + self.extra_lag_s * (rack_rad - last_rad) / PERIOD_S) / self.steering_gain
             alpha = self.car.lag_alpha
             acted = self.state.modelled_angle_rad + (modelled - self.state.modelled_angle_rad) / alpha
             latency = self.car.pose_latency_samples
@@ -164,6 +166,26 @@ def test_a_weak_steering_is_learnt_as_a_gain():
     state = drive.cycles(1300)
     assert state.steering_gain == pytest.approx(0.94, abs=0.012)
     assert abs(state.road_disturbance_rad) < 2e-3
+
+
+def test_a_weak_steering_is_known_before_the_first_bend_is_over():
+    drive = Drive(steering_gain=0.95)
+    while drive.station_m < 5.0:
+        state = drive.cycles(1)
+    assert state.steering_gain == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_slow_steering_looks_weak_only_while_the_wheels_turn():
+    """With 0.1 s more lag than nominal: turned in with more, back with less, and known where the wheels stand."""
+    drive = Drive(extra_lag_s=0.1)
+    seen = {}
+    while drive.station_m < 10.3:
+        state = drive.cycles(1)
+        seen[drive.station_m] = state.steering_gain
+    assert min(gain for station_m, gain in seen.items() if station_m < 4.5) < 0.95
+    assert max(gain for station_m, gain in seen.items() if 6.5 < station_m < 8.0) > 1.05
+    steady = [gain for station_m, gain in seen.items() if 5.6 < station_m < 6.0 or station_m > 9.0]
+    assert steady == pytest.approx([1.0] * len(steady), abs=0.02)
 
 
 def test_a_gyro_that_drifts_while_driving_is_corrected_by_the_poses():

@@ -94,7 +94,7 @@ def test_a_prediction_is_the_textbooks(body_m, with_yaw_rate, standstill):
     turn = 0.0 if standstill else -half_s if with_yaw_rate else body_m
     slipped_m = 2e-4
     f = np.diag([1.0, 1.0, 1.0, 1.0, kept, kept])
-    f[0, 1], f[0, 2], f[0, 3], f[1, 2] = body_m, 0.5 * body_m * turn, -slipped_m, turn
+    f[0, 1], f[0, 2], f[0, 3], f[1, 2] = body_m, 0.5 * body_m * turn, slipped_m, turn
     way_m = abs(body_m)
     yaw_rate = kalman.HEADING_WALK**2 * way_m + kalman.YAW_RATE_NOISE_RADPS**2 * kalman.PERIOD_S * half_s
     noises = (kalman.SIDE_SLIP**2 * way_m, yaw_rate, kalman.YAW_RATE_WALK**2 * half_s)
@@ -160,12 +160,12 @@ def test_it_is_the_covariance_of_many_cars_that_are_corrected_so(noise, sigma, w
     else:
         side, walk, other = (value * way_root for value in WALKS)
     left = 1.0 - kalman.KEPT**2
-    slipped_m = 3e-5  # 3 mrad of slip, as at 1 m/s in a sharp bend
+    slipped_m = -3e-5  # 3 mrad of slip, as at 1 m/s in a sharp bend
     for interval in range(30):
         poses = 10 if interval % 7 else 3
         g = state.gains
         for cycle in range(10):
-            e_m += way_m * (p_rad + 0.5 * turn * x) - slipped_m * slip + rng.normal(0.0, side, cars)
+            e_m += way_m * (p_rad + 0.5 * turn * x) + slipped_m * slip + rng.normal(0.0, side, cars)
             p_rad += turn * x + rng.normal(0.0, walk, cars)
             x += rng.normal(0.0, other, cars)
             slip += rng.normal(0.0, kalman.SLIP_WALK * way_root, cars)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from design_support import (
     NOMINAL,
+    Bend,
     FirmwareLaw,
     StraightRoad,
     corner,
@@ -72,10 +73,15 @@ def diverges(row, car, mode):
     """Whether a millimetre off the path grows over 60 m of straight road, under the firmware's own functions."""
     cycles = round(60.0 / row.speed_mps / 0.01)
     law = FirmwareLaw(row, NOMINAL, mode)
-    errors = np.abs(drive(law, StraightRoad(car, row.speed_mps, row.direction, e_m=1e-3), cycles))
-    if len(errors) < cycles:
+    return grow(drive(law, StraightRoad(car, row.speed_mps, row.direction, e_m=1e-3), cycles), cycles)
+
+
+def grow(errors_m, cycles):
+    """Whether errors grow, or were broken off as they had left the believable."""
+    if len(errors_m) < cycles:
         return True
     quarter = cycles // 4
+    errors = np.abs(errors_m)
     return bool(errors[-quarter:].max() > errors[quarter : 2 * quarter].max())
 
 
@@ -134,6 +140,38 @@ def test_the_delay_margin_is_the_latency_at_which_it_breaks(direction):
     assert simulated == pytest.approx(margin, rel=0.2)
 
 
+def test_in_a_bend_it_breaks_at_less_latency_as_foretold():
+    """With the wheels far from straight the steering's gain is learnt at once, which is an integral about them."""
+    row = row_at(designed()["car"], 1.0, 1.0)
+    nominal = NOMINAL._replace(pose_latency_samples=0)
+    car = corner(pose_latency_samples=0)
+
+    def foretold(mode):
+        system = model.controller(row, nominal, design.MODES["car"][mode])
+
+        def is_unstable(samples):
+            late = car._replace(command_latency_samples=car.command_latency_samples + samples)
+            return not model.is_stable(model.closed_loop(system, model.car(late, 1.0, 1.0)))
+
+        return first_unstable(is_unstable, 0.0, 80.0, 12)
+
+    name = "car, poses without noise, in a bend"
+    margin = foretold(name)
+    cycles = 5000
+
+    def found(angle_rad):
+        def breaks(samples):
+            bend = Bend(row, nominal, design.MODES["car"][name], angle_rad, samples, e_m=1e-3)
+            return grow(bend.cross_track_errors_m(cycles), cycles)
+
+        return first_unstable(breaks, 0.8 * margin, 1.4 * margin)
+
+    sharp = found(0.45)
+    assert sharp == pytest.approx(margin, rel=0.2)
+    assert found(0.05) > 1.05 * sharp
+    assert foretold("car, poses without noise") > 1.2 * margin
+
+
 # The certificate
 
 
@@ -158,6 +196,9 @@ def test_the_shipped_cars_are_certified(certificate):
         found = certificate.others[f"car, poses {poses}"]
         assert found["min_disk_margin"] >= 0.6
         assert found["min_delay_margin_samples"] >= 12.0
+    in_bend = certificate.others["car, poses without noise, in a bend"]
+    assert 0.5 <= in_bend["min_disk_margin"] < certificate.others["car, poses without noise"]["min_disk_margin"]
+    assert in_bend["min_delay_margin_samples"] >= 10.0
     assert certificate.min_disk_margin == min(disk for _, _, disk, _ in certificate.by_speed)
 
 

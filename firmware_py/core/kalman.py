@@ -189,7 +189,7 @@ class Interval(NamedTuple):
     """`GAINS_EVERY` cycles.
 
     `body_m` is the way along the body (negative in reverse), `slipped_m` how far the nominal car's slip took it to the
-    right on it, `poses` how many were believed, `stated_m` the standard deviation that the localisation states for a
+    left on it, `poses` how many were believed, `stated_m` the standard deviation that the localisation states for a
     position (0: it does not know), `averaged` how many poses a standing car's place is the average of, `bias_averaged`
     how many yaw rates the gyro's bias is; `standstill` is 1 for a car that stands.
     """
@@ -320,7 +320,7 @@ def predict(
 ) -> Covariance:
     """Return the covariance half of `GAINS_EVERY` cycles later, after a way along the body (m).
 
-    `slipped_m`: to the right, by the nominal car's slip.
+    `slipped_m`: to the left, by the nominal car's slip.
     """
     ee, ep, ex, ec, es, et, pp, px, pc, ps, pt, xx, xc, xs, xt, cc, cs, ct, ss, st, tt = before
     way_m = abs(body_m)
@@ -343,22 +343,22 @@ def predict(
         heading_rad2 = walks.heading * walks.heading * way_m
         other = walks.road * walks.road * way_m
         slip2 = SLIP_WALK * SLIP_WALK * way_m
-    # e += body_m p + aside x - slipped_m c, p += turn x.
+    # e += body_m p + aside x + slipped_m c, p += turn x.
     aside = 0.5 * body_m * turn
     kept = KEPT_HALF
     left = 1.0 - kept * kept
     # What e comes to, with each of the others as it was before.
-    e_p = ep + body_m * pp + aside * px - slipped_m * pc
-    e_x = ex + body_m * px + aside * xx - slipped_m * xc
-    e_c = ec + body_m * pc + aside * xc - slipped_m * cc
+    e_p = ep + body_m * pp + aside * px + slipped_m * pc
+    e_x = ex + body_m * px + aside * xx + slipped_m * xc
+    e_c = ec + body_m * pc + aside * xc + slipped_m * cc
     px_after = px + turn * xx
     return Covariance(
-        ee + body_m * (ep + e_p) + aside * (ex + e_x) - slipped_m * (ec + e_c) + cross_m2,
+        ee + body_m * (ep + e_p) + aside * (ex + e_x) + slipped_m * (ec + e_c) + cross_m2,
         e_p + turn * e_x + 0.5 * body_m * heading_rad2,
         e_x,
         e_c,
-        kept * (es + body_m * ps + aside * xs - slipped_m * cs),
-        kept * (et + body_m * pt + aside * xt - slipped_m * ct),
+        kept * (es + body_m * ps + aside * xs + slipped_m * cs),
+        kept * (et + body_m * pt + aside * xt + slipped_m * ct),
         pp + turn * (px + px_after) + heading_rad2,
         px_after + 0.5 * turn * other,
         pc + turn * xc,

@@ -83,14 +83,16 @@ class Corner(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """How the controller runs: predicting or not (`pid+ff`), with a fresh yaw rate or without, with whose poses.
+    """How the controller runs: predicting or not (`pid+ff`), with a fresh yaw rate or without, with whose poses, where.
 
-    `localisation` is a key of `tools.design.filter.LOCALISATIONS`.
+    `localisation` is a key of `tools.design.filter.LOCALISATIONS`. `in_bend`: with the wheels far from straight, where
+    the estimator takes a gap between measured and nominal angle for the steering's gain at once.
     """
 
     predicts: bool = True
     with_yaw_rate: bool = True
     localisation: str = "white"
+    in_bend: bool = False
 
 
 class StateSpace(NamedTuple):
@@ -275,6 +277,11 @@ class _Cycle:
         self.speed_mps = row.speed_mps
         table = GainTable((row.speed_mps, row.speed_mps + 1.0), 1, ((row[2:], row[2:]),) * 2)
         self.gains = gains_at(table, 0, row.speed_mps)
+        if mode.in_bend:
+            # At a large angle a change of the learnt gain moves the command as one of the offset does; of the gap it
+            # takes up to this share, the nearer the larger the angle.
+            learnt = estimator.STEERING_GAIN_1PM * row.speed_mps * PERIOD_S
+            self.gains = self.gains._replace(offset=self.gains.offset + learnt)
         self.filter = filter_of(row, mode)
         self.memory = nominal.pose_latency_samples if mode.predicts else 0
         self.sent = nominal.command_latency_samples + 2
