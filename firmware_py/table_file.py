@@ -40,6 +40,7 @@ GAINS_COLUMNS = (
     "ki",
     "kd",
     "l_o",
+    "l_g",
     "l_dr",
     "w_e",
     "w_p",

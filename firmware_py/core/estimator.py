@@ -58,11 +58,8 @@ MOVING_PRIOR = 300
 """What the estimate of a moving car is worth when it comes to a stop, counted in poses (along the path) and in yaw
 rates (for the gyro's bias)."""
 
-STEERING_GAIN_1PM = 1.5
 STEERING_GAIN_ANGLE_RAD = 0.1
-"""How fast the steering's gain is learnt per metre of travel, and from what angle on. In a bend this is an integral
-about the wheels, which costs margin: with 2 the pickup has at 1 m/s a disk margin of 0.49 left, less than the
-certificate asks for, with 1.5 of 0.52. Slower, a weak steering is known only when the first bend is over."""
+"""The angle from which on the steering's gain is learnt at more than half of the table's rate."""
 
 STEERING_GAIN_SPREAD = 0.1
 STEERING_OFFSET_MAX_RAD = 0.03
@@ -249,7 +246,7 @@ def estimate(
             offset_rad += gains.offset * gap_rad
             offset_rad = bounded(offset_rad, -STEERING_OFFSET_MAX_RAD, STEERING_OFFSET_MAX_RAD)
             weight = modelled_rad * modelled_rad + STEERING_GAIN_ANGLE_RAD * STEERING_GAIN_ANGLE_RAD
-            gain += STEERING_GAIN_1PM * abs(ds_m) * modelled_rad * gap_rad / weight
+            gain += gains.gain * modelled_rad * gap_rad / weight
             gain = bounded(gain, 1.0 - STEERING_GAIN_SPREAD, 1.0 + STEERING_GAIN_SPREAD)
 
     # The path at the station that odometry has come to.

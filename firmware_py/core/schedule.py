@@ -2,16 +2,17 @@
 
 from typing import NamedTuple
 
-from firmware_py.core.tables import KD, KI, KP, L_DR, L_O, PREVIEW, W_D, W_E, W_P, GainTable
+from firmware_py.core.tables import KD, KI, KP, L_DR, L_G, L_O, PREVIEW, W_D, W_E, W_P, GainTable
 
 
 class Gains(NamedTuple):
     """The gains of one cycle.
 
     kp is in 1/m^2 (curvature per metre of preview error), ki in 1/m^3, kd in 1/m (curvature per radian), preview in
-    m. The rest is the estimator's: a 10 ms cycle's `offset` of the steering offset for the gap to the nominal actuator,
-    and `dr` of the road disturbance for the gap between yaw rate and steering (1/m for a radian); without the yaw rate
-    `*_walk`, noise of cross-track error (m), heading (rad) and road disturbance (1/m) per root metre of travel.
+    m. The rest is the estimator's, for a 10 ms cycle: what the steering's `offset` and, at a large angle, its `gain`
+    take of the gap to the nominal actuator, and `dr` the road disturbance of the gap between yaw rate and steering (1/m
+    for a radian); without the yaw rate `*_walk`, noise of cross-track error (m), heading (rad) and road disturbance
+    (1/m) per root metre of travel.
     """
 
     preview_m: float
@@ -19,6 +20,7 @@ class Gains(NamedTuple):
     ki: float
     kd: float
     offset: float
+    gain: float
     dr: float
     cross_walk: float
     heading_walk: float
@@ -52,6 +54,7 @@ def gains_at(table: GainTable, direction: int, travel_speed_mps: float) -> Gains
         a * low[KI] + b * high[KI],
         a * low[KD] + b * high[KD],
         a * low[L_O] + b * high[L_O],
+        a * low[L_G] + b * high[L_G],
         a * low[L_DR] + b * high[L_DR],
         a * low[W_E] + b * high[W_E],
         a * low[W_P] + b * high[W_P],

@@ -13,8 +13,8 @@ FORWARD = 0
 REVERSE = 1
 
 # Columns of a gain schedule's row, in the order of the file.
-PREVIEW, KP, KI, KD, L_O, L_DR, W_E, W_P, W_D = range(9)
-GAIN_COLUMNS = 9
+PREVIEW, KP, KI, KD, L_O, L_G, L_DR, W_E, W_P, W_D = range(10)
+GAIN_COLUMNS = 10
 
 # The laws: PID on the poses as they come; on what estimator and predictor make of them; the paper's own (`paper_law`).
 LAW_PLAIN, LAW_CAR, LAW_PAPER = range(3)

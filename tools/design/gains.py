@@ -51,6 +51,11 @@ OFFSET_LENGTH_M = 6.0
 would be taken for an offset in every bend, and short enough that a leg shows a real one. From 3 to 12 m the errors are
 the same; the disk margin of the paper's car at 1 m/s is 0.78 with 3 m, 0.82 with 6 m and 0.84 with 12 m."""
 
+GAIN_RATE_MAX_1PM = 1.5
+"""What the steering's gain takes at most of a gap between measured and nominal angle, per metre in a bend, where it is
+an integral about the wheels. With it a weak steering is known before the first bend is over; with 3 the errors are the
+same. Where the loop in a bend would keep too little margin it is less."""
+
 DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
 """Without the yaw rate: noise of cross-track error (m), heading (rad) and road disturbance (1/m) per root metre. The
 last stands for steering bias, steering gain and tyres, whose effect changes as the path bends."""
@@ -79,6 +84,10 @@ past the path after each. Slower than the D-region allows (`slowest_pole_1pm`) i
 
 SLOWEST_PACE = 0.3
 """Below it a start off the path would not be corrected within a leg."""
+
+BEND_RESERVE = 1.05
+"""Disk margin and damping in a bend over what the vehicle's file asks for, for what the grids miss: nothing is built
+upon the learnt gain, so that it may have all the margin that the PID leaves."""
 
 RESERVE = 1.2
 """The gains' disk margin and damping over what the vehicle's file asks for: what is blended between two rows has a
@@ -202,12 +211,15 @@ def road_gain(direction: float, speed_mps: float) -> float:
     return variance * ds / (variance * ds * ds + noise)
 
 
-def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float) -> Row:
+def row_of(
+    law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float, gain_rate_1pm: float = 0.0
+) -> Row:
     """A row of the gain table; a law that takes each pose as it comes estimates nothing, whatever its pace."""
-    offset = road = 0.0
+    offset = gain = road = 0.0
     walks = (0.0, 0.0, 0.0)
     if law == "car":
         offset = 1.0 - math.exp(-speed_mps * model.PERIOD_S / OFFSET_LENGTH_M)
+        gain = gain_rate_1pm * speed_mps * model.PERIOD_S
         road = road_gain(direction, speed_mps)
         walks = observer_noise(observer_pace)
     numbers = (
@@ -216,6 +228,7 @@ def row_of(law: str, direction: float, speed_mps: float, pid_pace: float, observ
         PREVIEW_S * speed_mps,
         *pid_gains(law, pid_pace),
         offset,
+        gain,
         road,
         *walks,
     )
@@ -268,10 +281,14 @@ def least_disk_margin(vehicle: Vehicle, law: str) -> float:
 
 
 class Schedule(NamedTuple):
-    """What was chosen for a law: the observer's pace without the yaw rate, and the PID's pace at each speed."""
+    """What was chosen for a law: the observer's pace without the yaw rate, and at each speed the other two.
+
+    They are the PID's pace, and how fast the steering's gain is learnt in a bend.
+    """
 
     observer_pace: float
     pid_pace: tuple[float, ...]
+    gain_rate_1pm: tuple[float, ...]
 
 
 def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
@@ -289,9 +306,9 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
     for law in LAWS:
         schedule = choose(vehicle, law)
         tables[law] = [
-            tuple(row_of(law, direction, speed, pace, schedule.observer_pace))
+            tuple(row_of(law, direction, speed, pace, schedule.observer_pace, rate_1pm))
             for direction in (1.0, -1.0)
-            for speed, pace in zip(SPEED_GRID_MPS, schedule.pid_pace, strict=True)
+            for speed, pace, rate_1pm in zip(SPEED_GRID_MPS, schedule.pid_pace, schedule.gain_rate_1pm, strict=True)
         ]
     return tables
 
@@ -322,6 +339,7 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
     at = {speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked}
     usual, *others = MODES[law].values()
     paces: list[float] = []
+    rates_1pm: list[float] = []
     # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
     for speed in reversed(checked):
 
@@ -333,7 +351,16 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
         if pace is None:
             raise UserError(_why_not(vehicle, law))
         paces.append(pace)
+
+        def survives_bends(rate_1pm: float, speed: float = speed, pace: float = pace) -> bool:
+            row = row_of(law, 1.0, speed, pace, OBSERVER_PACES[0], rate_1pm)
+            least = BEND_RESERVE * vehicle.criteria.least_disk_margin
+            in_bends = (mode for mode in others if mode.in_bend)
+            return all(_survives(row, vehicle, mode, at[speed], least, BEND_RESERVE) for mode in in_bends)
+
+        rates_1pm.append(_largest(survives_bends, 0.0, GAIN_RATE_MAX_1PM) or 0.0)
     paces.reverse()
+    rates_1pm.reverse()
     observer_pace = OBSERVER_PACES[0]
     for mode in others:
         if mode.with_yaw_rate:
@@ -356,15 +383,21 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
             OBSERVER_PACES[-1],
         )
     beyond = len(SPEED_GRID_MPS) - 1 - len(checked)
-    return Schedule(observer_pace, (paces[0], *paces, *(paces[-1],) * beyond))
+    return Schedule(
+        observer_pace,
+        (paces[0], *paces, *(paces[-1],) * beyond),
+        (rates_1pm[0], *rates_1pm, *(rates_1pm[-1],) * beyond),
+    )
 
 
-def _survives(row: Row, vehicle: Vehicle, mode: Mode, at: CarsAtSpeed, least_margin: float) -> bool:
+def _survives(
+    row: Row, vehicle: Vehicle, mode: Mode, at: CarsAtSpeed, least_margin: float, reserve: float = RESERVE
+) -> bool:
     law = model.controller(row, model.nominal_of(vehicle), mode)
     if float(disk_margin(model.loops(law, at.answers, at.z)).min()) < least_margin:
         return False
     matrices = (model.closed_loop(law, plant) for plant in at.plants)
-    return all(d_stable(matrix, row.speed_mps, vehicle.criteria, RESERVE) for matrix in matrices)
+    return all(d_stable(matrix, row.speed_mps, vehicle.criteria, reserve) for matrix in matrices)
 
 
 def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int = 7) -> float | None:

@@ -51,6 +51,7 @@ class Row(NamedTuple):
     ki: float
     kd: float
     l_o: float
+    l_g: float
     l_dr: float
     w_e: float
     w_p: float
@@ -279,9 +280,8 @@ class _Cycle:
         self.gains = gains_at(table, 0, row.speed_mps)
         if mode.in_bend:
             # At a large angle a change of the learnt gain moves the command as one of the offset does; of the gap it
-            # takes up to this share, the nearer the larger the angle.
-            learnt = estimator.STEERING_GAIN_1PM * row.speed_mps * PERIOD_S
-            self.gains = self.gains._replace(offset=self.gains.offset + learnt)
+            # takes this share at most.
+            self.gains = self.gains._replace(offset=self.gains.offset + self.gains.gain)
         self.filter = filter_of(row, mode)
         self.memory = nominal.pose_latency_samples if mode.predicts else 0
         self.sent = nominal.command_latency_samples + 2
