@@ -13,15 +13,15 @@ from compare_support import driver, numbers_of
 
 from sim.data_files import load_course, load_scenario, load_vehicle
 from tools import cli
-from tools.compare import command
 from tools.compare.runs import CONTROLLERS, LegFigures, RunFigures, side_of
+from tools.compare.verdicts import verdicts
 from tools.figures import leg_figures, load_path, split_legs, truth_of_rows
 from tools.lockstep import run_lockstep
 
 FIELDS = {
     "controller", "inputs", "scenario", "vehicle", "direction", "seeds", "max_cross_track_m", "p95_cross_track_m",
     "rms_cross_track_m", "final_cross_track_m", "final_heading_error_rad", "min_clearance_m", "command_jitter_rad",
-    "tick_us", "stopped_runs",
+    "tick_us", "stopped_runs", "latency_borne_samples",
 }  # fmt: skip
 SEED = 2_000_008  # driven on the right side
 
@@ -97,6 +97,35 @@ def test_rows_have_the_agreed_fields(told: tuple[dict[str, Any], Path]) -> None:
     assert shipped[:2] == shipped[2:]  # it brings its estimator along
 
 
+def test_rows_tell_the_latency_that_is_borne_and_a_claim_is_made_of_it(told: tuple[dict[str, Any], Path]) -> None:
+    borne = {(row["controller"], row["inputs"]): row["latency_borne_samples"] for row in told[0]["rows"]}
+    assert borne["car", "estimator"] >= 10
+    assert 0 <= borne["pid+ff", "estimator"] < 10
+    assert borne["pid+ff", "raw"] != borne["pid+ff", "estimator"]
+    claim = told[0]["claims"][-1]
+    assert claim["claim"].startswith("car: no worse than the best other that bears 10 samples of latency more")
+    assert (claim["best_other"], claim["bears_itself"], claim["holds"]) == (None, True, True)
+
+
+def test_the_latency_is_measured_in_its_scenario_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    driver()
+    file = tmp_path / "rows.json"
+    options = ["--controller", "car", "--controller", "pid+ff", "--inputs", "estimator", "--seeds", "1", "--jobs", "1"]
+    scenarios = ["--scenario", "car", "--scenario", "car-quiet"]
+    assert cli.main(["compare", *options, *scenarios, "--json", str(file)]) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert all((row["latency_borne_samples"] is None) == (row["scenario"] == "car-quiet") for row in rows)
+    printed = capsys.readouterr().out
+    header = next(line for line in printed.splitlines() if "car-quiet" in line)
+    assert [cell.strip() for cell in header.strip("┃").split("┃")] == ["", "car", "latency", "car-quiet", "us"]
+    assert "latency: added samples of 10 ms" in printed
+    assert cli.main(["compare", *options, "--scenario", "car-quiet", "--json", str(file)]) == 0
+    content = json.loads(file.read_text())
+    assert {row["latency_borne_samples"] for row in content["rows"]} == {None}
+    assert content["claims"] == []
+    assert "latency" not in capsys.readouterr().out
+
+
 def test_the_shipped_law_has_at_most_half_the_error_of_pid_ff_on_raw_inputs(told: tuple[dict[str, Any], Path]) -> None:
     claims = {claim["claim"]: claim for claim in told[0]["claims"]}
     raw = claims["car: at most half of the best other on raw inputs"]
@@ -114,7 +143,7 @@ def test_a_claim_that_does_not_hold_is_said_not_to() -> None:
         leg = LegFigures(error_m, error_m**2, 1.0, 0.0, 0.0, 0.3, 0.0)
         return [RunFigures((leg, leg), True)]
 
-    judged = command.verdicts(
+    judged = verdicts(
         {
             ("car", "car", "raw"): runs(0.003),
             ("car", "lqr", "raw"): runs(0.005),
@@ -132,7 +161,7 @@ def test_beside_a_verdict_stands_the_mean_difference_of_a_run_with_its_error() -
         return [RunFigures((leg, leg._replace(max_cross_track_m=0.0)), True) for leg in legs]
 
     own, other = runs(0.003, 0.001, 0.001, 0.001), runs(0.002, 0.002, 0.002, 0.001)
-    (verdict,) = command.verdicts({("car", "car", "estimator"): own, ("car", "lqr", "estimator"): other})
+    (verdict,) = verdicts({("car", "car", "estimator"): own, ("car", "lqr", "estimator"): other})
     assert not verdict.holds
     assert verdict.mean_difference_m == pytest.approx(-0.25e-3)
     assert verdict.standard_error_m == pytest.approx(1e-3 * math.sqrt((1.25**2 + 2 * 0.75**2 + 0.25**2) / 3 / 4))

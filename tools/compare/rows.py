@@ -35,12 +35,20 @@ class Both(NamedTuple):
 
 
 def row_of(
-    controller: str, inputs: str, scenario: str, vehicle: str, leg: int, runs: Sequence[RunFigures], tick_us: float
+    controller: str,
+    inputs: str,
+    scenario: str,
+    vehicle: str,
+    leg: int,
+    runs: Sequence[RunFigures],
+    tick_us: float,
+    latency_borne_samples: int | None,
 ) -> dict[str, Any]:
     """Return the row of one direction.
 
     Max over all seeds, p95 over the seeds' maxima, rms over all samples; final errors and clearance are the worst ones.
-    A run that was stopped counts with what it came to until then, and in `stopped_runs`.
+    A run that was stopped counts with what it came to until then, and in `stopped_runs`. `latency_borne_samples` is of
+    both directions together, as a run is.
     """
     legs = [run.legs[leg] for run in runs]
     maxima = [figures.max_cross_track_m for figures in legs]
@@ -61,6 +69,7 @@ def row_of(
         "command_jitter_rad": math.sqrt(sum(figures.jitter_rad**2 for figures in legs) / len(legs)),
         "tick_us": tick_us,
         "stopped_runs": sum(not run.completed for run in runs),
+        "latency_borne_samples": latency_borne_samples,
     }
 
 

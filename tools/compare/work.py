@@ -12,6 +12,7 @@ from multiprocessing import connection, get_context, parent_process
 from typing import Any, NamedTuple
 
 from sim.errors import UserError
+from tools.compare.latency import borne_samples
 from tools.compare.procedure import Tuned, cost_m, tune
 from tools.compare.runs import CONTROLLERS, Driver, RunFigures, Setting
 
@@ -48,6 +49,12 @@ def drive_task(task: Task) -> tuple[Task, list[RunFigures]]:
     law = CONTROLLERS[task.controller].law
     driver = _driver(task.scenario)
     return task, [driver.run(law, task.numbers, task.inputs, seed) for seed in task.seeds]
+
+
+def bear_task(task: Task) -> tuple[Task, int | None]:
+    """Measure how many added samples of command latency a law bears in the runs of a task, all together."""
+    law = CONTROLLERS[task.controller].law
+    return task, borne_samples(_settings[task.scenario], law, task.numbers, task.inputs, task.seeds)
 
 
 def tune_one(which: tuple[str, str, int]) -> tuple[tuple[str, str], Tuned]:
