@@ -35,10 +35,10 @@ SAME_TIME_S = 0.015
 SAME_STEER_RAD, SAME_SPEED_MPS = 0.016, 0.016
 """99 % of the replayed commands are as near as that to a recorded one of the same time, and half within a half.
 
-Nothing closes the loop of a replay. Cycles that got two poses or none in one run only, as on a busy machine, and the
-poses that come twice (`lead_in` in `vcan_session.py`) leave an estimate behind that is 0.3 mm and 0.1 mrad another;
-0.004 to 0.012 rad of 0.45 were seen of it in three sessions. What sets off a cycle earlier or later is 10 mm from where
-it was at 1 m/s, for which the law asks 0.008 m/s.
+Nothing closes the loop of a replay, and in a bend the learnt gain of the steering takes up what the commands differ by.
+Cycles that got two poses or none in one run only, as on a busy machine, and the lead-in's poses (`usual` in
+`vcan_session.py`) leave an estimate behind that is 0.1 mm another: 0.005 and 0.007 rad of 0.45 were seen of it. What
+sets off a cycle earlier or later is 10 mm from where it was at 1 m/s, for which the law asks 0.008 m/s.
 """
 WORST = 2.0
 """None is further off than so many times that."""
