@@ -175,8 +175,8 @@ def test_a_weak_steering_is_known_before_the_first_bend_is_over():
     assert state.steering_gain == pytest.approx(0.95, abs=0.01)
 
 
-def test_a_slow_steering_looks_weak_only_while_the_wheels_turn():
-    """With 0.1 s more lag than nominal: turned in with more, back with less, and known where the wheels stand."""
+def test_a_slow_steering_is_known_where_the_wheels_stand_in_a_bend():
+    """With 0.1 s more lag than nominal: known where they stand in a bend, and what turning back taught ends the leg."""
     drive = Drive(extra_lag_s=0.1)
     seen = {}
     while drive.station_m < 10.3:
@@ -184,8 +184,24 @@ def test_a_slow_steering_looks_weak_only_while_the_wheels_turn():
         seen[drive.station_m] = state.steering_gain
     assert min(gain for station_m, gain in seen.items() if station_m < 4.5) < 0.95
     assert max(gain for station_m, gain in seen.items() if 6.5 < station_m < 8.0) > 1.05
+    assert drive.cycles(200).steering_gain > 1.03
     steady = [gain for station_m, gain in seen.items() if 5.6 < station_m < 6.0 or station_m > 9.0]
     assert steady == pytest.approx([1.0] * len(steady), abs=0.02)
+
+
+@pytest.mark.parametrize("angle_rad", [0.4, 0.1, -0.25])
+@pytest.mark.parametrize("gap_rad", [0.002, -0.003])
+def test_a_gap_teaches_the_gain_by_the_tables_share(angle_rad, gap_rad):
+    """At most that share of the gap as an angle: all of it at large angles, half at 0.1 rad; none at standstill."""
+    drive = Drive(speed_mps=1.0)
+    gains = gains_at(drive.tables.gains, FORWARD, 1.0)._replace(gain=0.012)
+    state = drive.state._replace(modelled_angle_rad=angle_rad)
+    motion = estimator.Motion(0.01, PERIOD_S, angle_rad, angle_rad + gap_rad, 1, 0.0, 0, 0, 1)
+    args = (drive.leg, drive.car, gains, state, motion, 0, 0.0, 0.0, 0.0, 1, 0.01, 1)
+    learnt = estimator.estimate(*args).steering_gain - 1.0
+    share = angle_rad * angle_rad / (angle_rad * angle_rad + 0.01)
+    assert learnt * angle_rad == pytest.approx(0.012 * share * gap_rad, rel=1e-9)
+    assert gains_at(drive.tables.gains, FORWARD, 0.0).gain == 0.0
 
 
 def test_a_gyro_that_drifts_while_driving_is_corrected_by_the_poses():

@@ -7,8 +7,8 @@ It is the disturbance observer of the law. Its states live at the instant of the
 - the road disturbance: angle by which the car turns as if its wheels stood otherwise than measured (alignment, play,
   tyres), which the yaw rate shows at once;
 - the steering's gain and offset: how the measured wheels differ from the nominal actuator's. The offset is learnt
-  slowly, the gain within a bend, so that a steering that is slower than known is turned in with more and back with
-  less; where the wheels stand, the gain is that of the steering again;
+  slowly, the gain within a bend. A steering that is slower than known looks weak while it turns in and strong while it
+  turns back; where the wheels stand in a bend the gain is the steering's own again, on the straight it stays as it was;
 - the odometry's scale, learnt from what the poses find along the path;
 - the rear tyres' slip, as a multiple of the nominal car's, learnt from what the poses find across it.
 

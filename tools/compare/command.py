@@ -51,9 +51,10 @@ Errors of metres are no slip: in the sharpest bend the heaviest car on the softe
 and a law with large gains and no bound on its correction then swings between the limits to the end.
 Latency is how many samples of 10 ms the steering command may take longer in `car` than the law knows of, so that in
 every corner of the car on either side (the first 16 seeds) the run still comes to its end and stays within 50 mm of
-the path; - is a law that does not even with none added. A small error can be bought with gains that leave little of
-it: the last verdict holds `car` against those only that bear what the vehicle file asks of a design
-(least_delay_margin_samples), and `car` has to bear that itself."""
+the path, with the firmware's supervision, which would stop some of them, out of the way; - is a law that does not even
+with none added. A small error can be bought with gains that leave little of it: the last verdict holds `car` against
+those only that bear what the vehicle file asks of a design (least_delay_margin_samples), and `car` has to bear that
+itself. With fewer seeds than 16 not every corner was driven."""
     what = parser.add_argument_group("what is compared")
     what.add_argument(
         "--scenario",

@@ -27,9 +27,9 @@ class Certificate(NamedTuple):
     every pole of every loop is in the D-region, those of `others` included. `holds`: D-stable with at least the margins
     that the vehicle's file asks for (`Criteria`), with all localisations, or there are no tables for the vehicle.
 
-    `others` holds the same figures for what is not the usual: the law with poses of less or of slower noise, in a bend,
-    without the yaw rate, and the other laws. With slow noise the region asks for damped poles only, not for fast ones:
-    such poses teach a gyro's bias slowly, however they are used.
+    `others` holds the same figures for what is not the usual: the law with poses of less or of slower noise, with those
+    of less noise in a bend, without the yaw rate, and the other laws. With slow noise the region asks for damped poles
+    only, not for fast ones: such poses teach a gyro's bias slowly, however they are used.
     `by_speed` has the smallest disk margin and delay margin of each (direction, speed in m/s).
     """
 
