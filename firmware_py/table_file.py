@@ -27,7 +27,7 @@ from firmware_py.core.tables import (
 from firmware_py.errors import UserError
 from firmware_py.feedforward import slip_feedforward
 
-FORMAT = 2
+FORMAT = 3
 REMEDY = "run `parkctl design --update`"
 
 PATH_COLUMNS = ("station_m", "x_m", "y_m", "yaw_rad", "curvature_1pm", "curvature_slope_1pm2")

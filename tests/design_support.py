@@ -15,7 +15,7 @@ from tools.design.filter import LOCALISATIONS
 from tools.design.model import Corner, Mode, Nominal, Row, nominal_car, straight_leg
 
 PERIOD_S = 0.01
-NOMINAL = Nominal(4.0, 0.1, 1, 1)
+NOMINAL = Nominal(4.0, 0.1, 1, 1, 0.45)
 
 
 def vehicle_of(name="paper", scenario=None, **overlay):

@@ -18,6 +18,7 @@ from sim.errors import UserError
 from tools.design import gains as design
 from tools.design import model
 from tools.design.filter import HEADING_NOISE_RAD, POSITION_NOISE_M, settled
+from tools.design.margins import disk_margin, frequencies, on_circle
 
 DIRECTIONS = (1.0, -1.0)
 RUNS = [(law, mode) for law, modes in design.MODES.items() for mode in modes.values()]
@@ -98,7 +99,9 @@ def test_the_cars_model_is_the_emulators_plant_driven_in_small_steps(direction, 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 @pytest.mark.parametrize(("law", "mode"), [run for run in RUNS if not run[1].in_bend])
-@pytest.mark.parametrize("nominal", [NOMINAL, model.Nominal(2.8, 0.0, 0, 0), model.Nominal(4.0, 0.27, 3, 24)])
+@pytest.mark.parametrize(
+    "nominal", [NOMINAL, model.Nominal(2.8, 0.0, 0, 0, 0.6), model.Nominal(4.0, 0.27, 3, 24, 0.45)]
+)
 def test_the_controllers_model_answers_as_the_firmware_does(direction, law, mode, nominal):
     row = row_at(designed()[law], direction, 0.6)
     system = model.controller(row, nominal, mode)
@@ -118,7 +121,7 @@ def test_the_controllers_model_answers_as_the_firmware_does(direction, law, mode
 
 @pytest.mark.parametrize(("law", "mode"), RUNS)
 def test_frequency_responses_are_those_of_the_matrices(law, mode):
-    z = design.on_circle(design.frequencies(0.5, 25))
+    z = on_circle(frequencies(0.5, 25))
     row = row_at(designed()[law], -1.0, 0.5)
     system = model.controller(row, NOMINAL, mode)
     for car in (corner(), corner(steering_lag_s=0.0, pose_latency_samples=0, command_latency_samples=0.0)):
@@ -252,6 +255,26 @@ def test_between_two_rows_the_firmware_has_nearly_the_estimator_of_that_speed(di
         assert found.dr == pytest.approx(design.road_gain(DIRECTIONS[direction], speed), rel=0.05)
 
 
+def test_each_column_of_a_table_comes_to_the_gain_of_its_name():
+    fields = {
+        "preview_m": "preview_m",
+        "kp": "kp",
+        "ki": "ki",
+        "kd": "kd",
+        "l_o": "offset",
+        "l_g": "gain",
+        "l_dr": "dr",
+        "w_e": "cross_walk",
+        "w_p": "heading_walk",
+        "w_d": "road_walk",
+    }
+    numbers = {name: 100.0 + index for index, name in enumerate(GAINS_COLUMNS[2:])}
+    row = tuple(numbers.values())
+    found = gains_at(GainTable((0.0, 1.0), 1, ((row, row),) * 2), 0, 0.3)
+    assert {name: getattr(found, field) for name, field in fields.items()} == pytest.approx(numbers)
+    assert set(fields.values()) == set(found._fields)
+
+
 # The choice
 
 
@@ -261,14 +284,14 @@ def test_the_choice_is_the_fastest_that_keeps_the_margin_and_the_next_faster_doe
     row = row_at(designed("paper", "slow-rack")["car"], 1.0, 1.0)
     pace = math.sqrt(row.kp / 3.0)
     assert design.SLOWEST_PACE < pace < design.FASTEST_PACE["car"], "the margins decide here, not the ends"
-    z = design.on_circle(design.frequencies(1.0))
+    z = on_circle(frequencies(1.0))
 
     def least(pace):
         kp, ki, kd = design.pid_gains("car", pace)
         faster = row._replace(kp=kp, ki=ki, kd=kd)
-        return design.disk_margin(model.loop_response(model.controller(faster, nominal), faster, cars, z)).min()
+        return disk_margin(model.loop_response(model.controller(faster, nominal), faster, cars, z)).min()
 
-    assert least(pace) >= design.least_disk_margin(vehicle, "car") > least(1.03 * pace)
+    assert least(pace) >= design.demand_of(vehicle, "car", model.Mode()).disk_margin > least(1.03 * pace)
 
 
 def test_a_wider_box_gives_softer_gains_at_speed():

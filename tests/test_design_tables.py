@@ -1,6 +1,7 @@
 """The tables as files: fresh where they come with the project, whole or not there, stale once anything changes."""
 
 import json
+import re
 import shutil
 
 import pytest
@@ -91,8 +92,13 @@ def test_the_command_writes_tables_and_figures(tmp_path, capsys):
     folder, figures = tmp_path / "tables", tmp_path / "design.json"
     arguments = ["design", "--vehicle", "fusion", "--tables", str(folder), "--json", str(figures)]
     assert cli.main(arguments) == 0
-    assert "min_clearance_m" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "min_clearance_m" in shown
     found = json.loads(figures.read_text())
+    for name, of in {"car": found["certificate"], **found["certificate"]["others"]}.items():
+        disk, delay = f"{of['min_disk_margin']:.2f}", f"{of['min_delay_margin_samples']:.1f}"
+        assert re.search(rf"│{re.escape(name)} *│ *{disk}│ *{delay}│", shown), name
+    assert 0.5 < found["gains"]["steering_gain_rate_1pm"] <= 1.5
     assert set(found["path"]) >= {"max_curvature_1pm", "min_clearance_m", "length_m"}
     assert set(found["certificate"]) >= {"min_delay_margin_samples", "min_disk_margin", "all_d_stable", "worst"}
     assert load_tables(folder, "left", "pid+ff", PERIOD_S).vehicle == "fusion"

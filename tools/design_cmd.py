@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -138,13 +139,10 @@ def _design(vehicle: Vehicle, course: Course, folder: Path | None, out: Path | N
         sheet.draw(report, certificate, out / "design.png")
         _write_json(out / "design.json", figures)
         print(f"sheet in {out / 'design.png'}")
-    least = vehicle.criteria
     if not certificate.holds:
         raise UserError(
-            f"vehicle {vehicle.name}: the design does not hold in its whole box (disk margin"
-            f" {certificate.min_disk_margin:.2f} must be {least.least_disk_margin:g}, delay margin"
-            f" {certificate.min_delay_margin_samples:.1f} samples must be {least.least_delay_margin_samples:g},"
-            f" D-stable: {certificate.all_d_stable}); worst: {certificate.worst}"
+            f"vehicle {vehicle.name}: the design does not hold in its whole box: {'; '.join(certificate.lacks)};"
+            " narrow the box, or ask for less in [design]"
         )
     if folder is not None:
         tables.write_tables(report, folder)
@@ -232,14 +230,29 @@ def _show(figures: dict[str, Any]) -> None:
     table = Table(title=f"design: {figures['vehicle']} on {figures['course']}", title_justify="left")
     table.add_column("what")
     table.add_column("value", justify="right")
-    certificate = {name: value for name, value in figures["certificate"].items() if name not in ("others", "by_speed")}
-    parts = [("", figures["path"]), ("", certificate)]
-    parts += [(f"{name}: ", other) for name, other in figures["certificate"]["others"].items()]
-    for prefix, part in parts:
+    for part in (figures["path"], figures["gains"]):
         for name, value in part.items():
             shown = ", ".join(f"{v:.2f}" for v in value) if isinstance(value, list) else value
-            table.add_row(prefix + name, f"{shown:.4g}" if isinstance(shown, float) else str(shown))
-    Console().print(table)
+            table.add_row(name, f"{shown:.4g}" if isinstance(shown, float) else str(shown))
+    console = Console()
+    console.print(table)
+    certificate = figures["certificate"]
+    title = "certificate: the least of all cars of the box, speeds and directions"
+    table = Table(title=title, title_justify="left", padding=(0, 0))
+    table.add_column("law, and how it runs", no_wrap=True)
+    for name in ("disk\nmargin", "delay\nsamples", "gain\nfactor", "phase\ndeg", "D-stable"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, of in {"car": certificate, **certificate["others"]}.items():
+        table.add_row(
+            name,
+            f"{of['min_disk_margin']:.2f}",
+            f"{of['min_delay_margin_samples']:.1f}",
+            f"{of['min_gain_margin']:.2f}",
+            f"{math.degrees(of['min_phase_margin_rad']):.0f}",
+            "all" if of["all_d_stable"] else "NOT ALL",
+        )
+    console.print(table)
+    console.print(f"least disk margin of the usual: {certificate['worst']}", highlight=False, soft_wrap=True)
 
 
 def _write_json(file: Path | None, figures: dict[str, Any]) -> None:

@@ -372,7 +372,8 @@ def _report(
 
     both = {key: both_of(runs) for key, runs in figures.items()}
     ticks = {(row["controller"], row["inputs"]): row["tick_us"] for row in rows}
-    print_tables(console, prepared, both, ticks, borne)
+    titles = {name: prepared.settings[name].scenario.name for name in prepared.measured}
+    print_tables(console, titles, both, ticks, borne)
     judged = verdicts(figures, borne)
     for verdict in judged:
         console.print(line_of(verdict), soft_wrap=True, highlight=False)

@@ -12,29 +12,31 @@ from tools.compare.rows import Both
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tools.compare.command import Prepared
-
 
 def print_tables(
     console: Console,
-    prepared: Prepared,
+    titles: dict[str, str],
     both: dict[tuple[str, str, str], Both],
     ticks: dict[tuple[str, str], float],
     borne: Borne | None,
 ) -> None:
-    """Print a table for each kind of input: a line a controller, a column a scenario, the latency borne beside its."""
-    for inputs in prepared.inputs:
+    """Print a table for each kind of input: a line a controller, a column a scenario, the latency borne beside its.
+
+    `titles` are those of the columns by scenario; `both` is by scenario, controller and inputs, `ticks` by the latter
+    two, in the order of the lines.
+    """
+    for inputs in dict.fromkeys(inputs for _, inputs in ticks):
         of = "raw inputs" if inputs == "raw" else "behind the same estimator"
         table = Table(title=f"{of}: cross-track max / rms in mm", title_justify="left", padding=(0, 0))
         table.add_column("", no_wrap=True)
-        for scenario in prepared.measured:
-            table.add_column(prepared.settings[scenario].scenario.name, justify="right")
+        for scenario, title in titles.items():
+            table.add_column(title, justify="right")
             if borne is not None and scenario == SCENARIO:
                 table.add_column("latency", justify="right", no_wrap=True)
         table.add_column("us", justify="right", no_wrap=True)
-        for name in prepared.controllers:
+        for name in [name for name, given in ticks if given == inputs]:
             cells = []
-            for scenario in prepared.measured:
+            for scenario in titles:
                 cells.append(_cell(both[scenario, name, inputs]))
                 if borne is not None and scenario == SCENARIO:
                     cells.append(samples_cell(borne.samples[name, inputs], borne.most_samples))

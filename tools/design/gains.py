@@ -4,14 +4,14 @@ Everything is designed per metre of travel and stated for curvature, so that it 
 estimator's filter makes its gains itself, while it runs; margins are those with the gains that it has in the long run
 (`tools.design.filter`). The PID is one pattern of poles per metre (`pid_gains`), scaled by a pace. At every speed of
 the grid the pace is the largest one, up to the law's own, with which the nominal car and every corner of the vehicle's
-box keep their poles in the D-region (`d_stable`) and their disk margin (`least_disk_margin`), both with a reserve over
-what the vehicle's file asks for.
+box keep their poles in the D-region (`d_stable`), their disk margin and their delay margin, with a reserve over what
+the vehicle's file asks for (`Demand`).
 """
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from firmware_py.core.motion import QUEUE_LENGTH
 from sim.data_files import Criteria, Vehicle
 from sim.errors import UserError
 from tools.design import model
+from tools.design.margins import disk_margin, frequencies, margins_of, on_circle
 from tools.design.model import Complexes, Floats, Mode, Row
 
 LAWS = ("car", "pid_ff")
@@ -33,11 +34,13 @@ MODES: dict[str, dict[str, Mode]] = {
         "car, poses without noise": Mode(localisation="exact"),
         "car, poses without noise, in a bend": Mode(localisation="exact", in_bend=True),
         "car, poses with slow noise": Mode(localisation="slow"),
+        "car, poses with slow noise, in a bend": Mode(localisation="slow", in_bend=True),
         "car, without the yaw rate": Mode(with_yaw_rate=False),
+        "car, without the yaw rate, in a bend": Mode(with_yaw_rate=False, in_bend=True),
     },
     "pid_ff": {"pid_ff": Mode(predicts=False)},
 }
-"""How each law runs; the first is the usual one, for which its gains are chosen."""
+"""How each law runs; the one of the law's own name is the usual."""
 
 COLUMNS = Row._fields
 
@@ -53,8 +56,9 @@ the same; the disk margin of the paper's car at 1 m/s is 0.78 with 3 m, 0.82 wit
 
 GAIN_RATE_MAX_1PM = 1.5
 """What the steering's gain takes at most of a gap between measured and nominal angle, per metre in a bend, where it is
-an integral about the wheels. With it a weak steering is known before the first bend is over; with 3 the errors are the
-same. Where the loop in a bend would keep too little margin it is less."""
+an integral about the wheels. With it a weak steering is known before the first bend is over; with 3 the errors are up
+to 2 % smaller, and the paper's car has too little margin in a bend. Where the loop there would keep too little it is
+less."""
 
 DISTURBANCE = (0.5e-3, 2e-3, 5e-3)
 """Without the yaw rate: noise of cross-track error (m), heading (rad) and road disturbance (1/m) per root metre. The
@@ -85,13 +89,13 @@ past the path after each. Slower than the D-region allows (`slowest_pole_1pm`) i
 SLOWEST_PACE = 0.3
 """Below it a start off the path would not be corrected within a leg."""
 
-BEND_RESERVE = 1.05
-"""Disk margin and damping in a bend over what the vehicle's file asks for, for what the grids miss: nothing is built
-upon the learnt gain, so that it may have all the margin that the PID leaves."""
-
 RESERVE = 1.2
-"""The gains' disk margin and damping over what the vehicle's file asks for: what is blended between two rows has a
-little less than they, and a finer grid of frequencies finds a little less."""
+"""What the usual loop keeps over what the vehicle's file asks for, in margins and damping: what is blended between two
+rows has a little less than they, and a finer grid of frequencies finds a little less."""
+
+RESERVE_OF_OTHERS = 1.05
+"""The same with less usual poses and in a bend: nothing is built upon those, and the learnt gain may have all the
+margin that the PID leaves there."""
 
 LEAST_DISK_MARGIN_OF_PLAIN = 0.34
 """Of the law `pid_ff`, which is there to compare with: 1.4 times the steering gain or 19 degrees of phase."""
@@ -212,7 +216,7 @@ def road_gain(direction: float, speed_mps: float) -> float:
 
 
 def row_of(
-    law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float, gain_rate_1pm: float = 0.0
+    law: str, direction: float, speed_mps: float, pid_pace: float, observer_pace: float, gain_rate_1pm: float
 ) -> Row:
     """A row of the gain table; a law that takes each pose as it comes estimates nothing, whatever its pace."""
     offset = gain = road = 0.0
@@ -240,39 +244,46 @@ def row_of(
 # --------------------------------------------------------------------------------------------------------------------
 
 
-def frequencies(speed_mps: float, count: int = 200) -> Floats:
-    """Angular frequencies, rad/s, by even ratios from one period in 300 m of travel to half the rate of cycles."""
-    return np.geomspace(0.02 * speed_mps, 0.999 * math.pi / model.PERIOD_S, count)
-
-
-def on_circle(omega: Floats) -> Complexes:
-    """The points z of angular frequencies in rad/s."""
-    return np.asarray(np.exp(1j * omega * model.PERIOD_S))
-
-
-def disk_margin(loop: Complexes) -> Floats:
-    """Balanced disk margin of loops over the last axis: any gain and phase in the disk keeps a stable loop stable.
-
-    2 / max |S - T|, as python-control's `disk_margins` with skew 0 (Seiler, Packard, Gahinet 2020).
-    """
-    return np.asarray(2.0 * np.min(np.abs((1.0 + loop) / (1.0 - loop)), axis=-1))
-
-
 def d_stable(matrix: Floats, speed_mps: float, criteria: Criteria, reserve: float = 1.0) -> bool:
-    """Whether all poles of a closed loop lie in the D-region: fast enough per metre of travel, and damped.
+    """Whether all poles of a closed loop's matrix lie in the D-region (`in_region`)."""
+    return in_region(model.poles_1pm(matrix, speed_mps), speed_mps, criteria, reserve)
+
+
+def in_region(poles: Complexes, speed_mps: float, criteria: Criteria, reserve: float = 1.0) -> bool:
+    """Whether poles (1/m) lie in the D-region: fast enough per metre of travel, and damped.
 
     `reserve` is the factor on the least damping.
     """
-    poles = model.poles_1pm(matrix, speed_mps)
     if float(poles.real.max()) > criteria.slowest_pole_1pm:
         return False
     slow = poles[poles.real > -QUICK_1PS / speed_mps]
     return bool(np.all(-slow.real >= reserve * criteria.least_damping * np.abs(slow)))
 
 
-def least_disk_margin(vehicle: Vehicle, law: str) -> float:
-    """Disk margin that the gains of a law keep with every car of the box."""
-    return RESERVE * vehicle.criteria.least_disk_margin if law == "car" else LEAST_DISK_MARGIN_OF_PLAIN
+class Demand(NamedTuple):
+    """What every car of the box keeps with the chosen gains, in one mode of a law."""
+
+    disk_margin: float
+    delay_margin_samples: float
+    region: Criteria
+    damping_reserve: float
+
+
+def region_of(criteria: Criteria, mode: Mode) -> Criteria:
+    """The D-region of a mode: with slow noise damped poles only, as such poses teach a gyro's bias slowly anyway."""
+    return criteria.model_copy(update={"slowest_pole_1pm": 0.0}) if mode.localisation == "slow" else criteria
+
+
+def demand_of(vehicle: Vehicle, law: str, mode: Mode) -> Demand:
+    """What a vehicle's file asks of a law's mode, with its reserve."""
+    criteria = vehicle.criteria
+    reserve = RESERVE if mode.localisation == "white" and not mode.in_bend else RESERVE_OF_OTHERS
+    disk_margin, delay_samples = reserve * criteria.least_disk_margin, reserve * criteria.least_delay_margin_samples
+    if law != "car":
+        disk_margin, delay_samples = LEAST_DISK_MARGIN_OF_PLAIN, 0.0
+    elif not mode.with_yaw_rate:
+        disk_margin, delay_samples = LEAST_DISK_MARGIN_WITHOUT_YAW_RATE, 0.0
+    return Demand(disk_margin, delay_samples, region_of(criteria, mode), reserve)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -334,55 +345,12 @@ def cars_at_speed(cars: Sequence[model.Corner], speed_mps: float, direction: flo
 
 def choose(vehicle: Vehicle, law: str) -> Schedule:
     """The quickest schedule of a vehicle and law whose cars all survive; UserError where there is none."""
-    cars = corners(vehicle, softest_tyres=True)
-    checked = checked_speeds(vehicle)
-    at = {speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked}
-    usual, *others = MODES[law].values()
-    paces: list[float] = []
-    rates_1pm: list[float] = []
-    # The loop in reverse is the same but for the sign of the heading error: one direction tells all.
-    for speed in reversed(checked):
-
-        def survives(pace: float, speed: float = speed) -> bool:
-            row = row_of(law, 1.0, speed, pace, OBSERVER_PACES[0])
-            return _survives(row, vehicle, usual, at[speed], least_disk_margin(vehicle, law))
-
-        pace = _largest(survives, SLOWEST_PACE, FASTEST_PACE[law])
-        if pace is None:
-            raise UserError(_why_not(vehicle, law))
-        paces.append(pace)
-
-        def survives_bends(rate_1pm: float, speed: float = speed, pace: float = pace) -> bool:
-            row = row_of(law, 1.0, speed, pace, OBSERVER_PACES[0], rate_1pm)
-            least = BEND_RESERVE * vehicle.criteria.least_disk_margin
-            in_bends = (mode for mode in others if mode.in_bend)
-            return all(_survives(row, vehicle, mode, at[speed], least, BEND_RESERVE) for mode in in_bends)
-
-        rates_1pm.append(_largest(survives_bends, 0.0, GAIN_RATE_MAX_1PM) or 0.0)
-    paces.reverse()
-    rates_1pm.reverse()
-    observer_pace = OBSERVER_PACES[0]
-    for mode in others:
-        if mode.with_yaw_rate:
-            continue
-        observer_pace = next(
-            (
-                tried
-                for tried in OBSERVER_PACES
-                if all(
-                    _survives(
-                        row_of(law, 1.0, speed, pace, tried),
-                        vehicle,
-                        mode,
-                        at[speed],
-                        LEAST_DISK_MARGIN_WITHOUT_YAW_RATE,
-                    )
-                    for speed, pace in zip(reversed(checked), reversed(paces), strict=True)
-                )
-            ),
-            OBSERVER_PACES[-1],
-        )
-    beyond = len(SPEED_GRID_MPS) - 1 - len(checked)
+    choice = _Choice(vehicle, law)
+    speeds = checked_speeds(vehicle)
+    paces = [choice.pace_at(speed) for speed in reversed(speeds)][::-1]  # the fastest refuses first
+    observer_pace = choice.observer_pace(dict(zip(speeds, paces, strict=True)))
+    rates_1pm = [choice.gain_rate_at(speed, pace, observer_pace) for speed, pace in zip(speeds, paces, strict=True)]
+    beyond = len(SPEED_GRID_MPS) - 1 - len(speeds)
     return Schedule(
         observer_pace,
         (paces[0], *paces, *(paces[-1],) * beyond),
@@ -390,14 +358,74 @@ def choose(vehicle: Vehicle, law: str) -> Schedule:
     )
 
 
-def _survives(
-    row: Row, vehicle: Vehicle, mode: Mode, at: CarsAtSpeed, least_margin: float, reserve: float = RESERVE
-) -> bool:
+class _Choice:
+    """The cars of a vehicle's box, what a law's modes must keep with each, and the largest values that do.
+
+    The loop in reverse is the same but for the sign of the heading error: one direction tells all.
+    """
+
+    def __init__(self, vehicle: Vehicle, law: str) -> None:
+        self.vehicle, self.law = vehicle, law
+        self.demands = {mode: demand_of(vehicle, law, mode) for mode in MODES[law].values()}
+        cars = corners(vehicle, softest_tyres=True)
+        self.at = {
+            speed: cars_at_speed(cars, speed, 1.0, on_circle(frequencies(speed))) for speed in checked_speeds(vehicle)
+        }
+
+    def survive(
+        self, modes: Iterable[Mode], speed_mps: float, pace: float, observer_pace: float, rate_1pm: float
+    ) -> bool:
+        """Whether all cars keep in all these modes what is asked for."""
+        row = row_of(self.law, 1.0, speed_mps, pace, observer_pace, rate_1pm)
+        return all(_survives(row, self.vehicle, mode, self.at[speed_mps], self.demands[mode]) for mode in modes)
+
+    def pace_at(self, speed_mps: float) -> float:
+        """The PID's largest pace, with nothing learnt of the steering's gain; UserError where none survives."""
+
+        def survives(modes: list[Mode], pace: float) -> bool:
+            return self.survive(modes, speed_mps, pace, OBSERVER_PACES[0], 0.0)
+
+        pace: float | None = FASTEST_PACE[self.law]
+        every = [mode for mode in self.demands if mode.with_yaw_rate]
+        for modes in ([MODES[self.law][self.law]], every):  # the usual one mostly decides, and alone is found quickly
+            if pace is not None:
+                pace = _largest(partial(survives, modes), SLOWEST_PACE, pace)
+        if pace is None:
+            raise UserError(_why_not(self.vehicle, self.law))
+        return pace
+
+    def observer_pace(self, paces: dict[float, float]) -> float:
+        """The first of the observers without the yaw rate that survives at every speed, with the PID's pace there."""
+        modes = [mode for mode in self.demands if not mode.with_yaw_rate]
+        for tried in OBSERVER_PACES:
+            if all(self.survive(modes, speed_mps, pace, tried, 0.0) for speed_mps, pace in paces.items()):
+                return tried
+        return OBSERVER_PACES[-1]
+
+    def gain_rate_at(self, speed_mps: float, pace: float, observer_pace: float) -> float:
+        """The largest rate at which the steering's gain may be learnt, 1/m; modes that none helps do not decide."""
+        in_bends = [mode for mode in self.demands if mode.in_bend]
+        if not in_bends:
+            return 0.0
+        modes = [mode for mode in in_bends if self.survive([mode], speed_mps, pace, observer_pace, 0.0)]
+        rate_1pm = _largest(
+            lambda tried: self.survive(modes, speed_mps, pace, observer_pace, tried), 0.0, GAIN_RATE_MAX_1PM
+        )
+        assert rate_1pm is not None, "with 0 they survive"
+        return rate_1pm
+
+
+def _survives(row: Row, vehicle: Vehicle, mode: Mode, at: CarsAtSpeed, demand: Demand) -> bool:
     law = model.controller(row, model.nominal_of(vehicle), mode)
-    if float(disk_margin(model.loops(law, at.answers, at.z)).min()) < least_margin:
+    loops = model.loops(law, at.answers, at.z)
+    if float(disk_margin(loops).min()) < demand.disk_margin:
         return False
     matrices = (model.closed_loop(law, plant) for plant in at.plants)
-    return all(d_stable(matrix, row.speed_mps, vehicle.criteria, reserve) for matrix in matrices)
+    if not all(d_stable(matrix, row.speed_mps, demand.region, demand.damping_reserve) for matrix in matrices):
+        return False
+    omega = frequencies(row.speed_mps, len(at.z))
+    least_samples = demand.delay_margin_samples
+    return least_samples <= 0.0 or all(margins_of(loop, omega).delay_samples >= least_samples for loop in loops)
 
 
 def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int = 7) -> float | None:
@@ -419,37 +447,48 @@ def _why_not(vehicle: Vehicle, law: str) -> str:
     """One line that names the dimension of the box which keeps the softest gains from surviving."""
     nominal = model.nominal_of(vehicle)
     speed = checked_speeds(vehicle)[-1]
-    row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1])
-    z = on_circle(frequencies(speed))
-    system = model.controller(row, nominal, MODES[law][law])
+    row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1], 0.0)
+    omega = frequencies(speed)
+    modes = [mode for mode in MODES[law].values() if mode.with_yaw_rate]
+    systems = [(model.controller(row, nominal, mode), demand_of(vehicle, law, mode)) for mode in modes]
 
-    def margin(car: model.Corner) -> float:
-        if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed, vehicle.criteria):
-            return 0.0
-        return float(disk_margin(model.loop_response(system, row, [car], z))[0])
+    def share(car: model.Corner) -> float:
+        """Of what is asked for in margins, the least share that a car keeps."""
+        kept = math.inf
+        for system, demand in systems:
+            if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed, demand.region):
+                return 0.0
+            found = margins_of(model.loop_response(system, row, [car], on_circle(omega))[0], omega)
+            kept = min(kept, found.disk / demand.disk_margin)
+            if demand.delay_margin_samples > 0.0:
+                kept = min(kept, found.delay_samples / demand.delay_margin_samples)
+        return kept
 
     cars = corners(vehicle, softest_tyres=True)
-    worst = min(cars, key=margin)
+    worst = min(cars, key=share)
     # The dimension that helps most when it alone is nominal; where none helps enough, when it alone does not delay.
-    blamed = _dimension_that_helps(worst, cars[0], margin)
-    least = least_disk_margin(vehicle, law)
-    if blamed[0] < least:
+    blamed = _dimension_that_helps(worst, cars[0], share)
+    if blamed[0] < 1.0:
         ideal = cars[0]._replace(steering_lag_s=0.0, pose_latency_samples=0, command_latency_samples=0.0)
-        blamed = _dimension_that_helps(worst, ideal, margin)
+        blamed = _dimension_that_helps(worst, ideal, share)
+    usual = demand_of(vehicle, law, MODES[law][law])
+    asked = f"a disk margin of {usual.disk_margin:g}"
+    if usual.delay_margin_samples > 0.0:
+        asked += f" and a delay margin of {usual.delay_margin_samples:g} samples"
     keys = blamed[1]
     own, low, high = (
         sum(values) for values in zip(*((getattr(vehicle, key), *vehicle.box[key]) for key in keys), strict=True)
     )
     return (
-        f"vehicle {vehicle.name}: {' + '.join(keys)} = {own:g} ({low:g} to {high:g}): no gains of law {law} keep a disk"
-        f" margin of {least:g} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
+        f"vehicle {vehicle.name}: {' + '.join(keys)} = {own:g} ({low:g} to {high:g}): no gains of law {law} keep"
+        f" {asked} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
     )
 
 
 def _dimension_that_helps(
-    car: model.Corner, home: model.Corner, margin: Callable[[model.Corner], float]
+    car: model.Corner, home: model.Corner, share: Callable[[model.Corner], float]
 ) -> tuple[float, tuple[str, ...]]:
-    """The largest margin of a car with one dimension taken from `home`, and that dimension's keys in the file."""
+    """The largest share that a car keeps with one dimension taken from `home`, and that dimension's keys."""
     trials = {
         ("steering_lag_s",): car._replace(steering_lag_s=home.steering_lag_s),
         ("pose_latency_samples", "command_latency_samples"): car._replace(
@@ -457,6 +496,6 @@ def _dimension_that_helps(
         ),
         ("wheelbase_m",): car._replace(wheelbase_m=home.wheelbase_m, cg_to_rear_axle_m=home.cg_to_rear_axle_m),
     }
-    margins = {keys: margin(trial) for keys, trial in trials.items()}
-    best = max(margins, key=lambda keys: margins[keys])
-    return margins[best], best
+    shares = {keys: share(trial) for keys, trial in trials.items()}
+    best = max(shares, key=lambda keys: shares[keys])
+    return shares[best], best

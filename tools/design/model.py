@@ -59,12 +59,13 @@ class Row(NamedTuple):
 
 
 class Nominal(NamedTuple):
-    """What the controller believes of the car: wheelbase in m, lag in s, latencies in whole samples."""
+    """What the controller believes of the car: wheelbase in m, lag in s, latencies in whole samples, largest angle."""
 
     wheelbase_m: float
     steering_lag_s: float
     pose_latency_samples: int
     command_latency_samples: int
+    max_road_wheel_angle_rad: float
 
 
 class Corner(NamedTuple):
@@ -86,8 +87,9 @@ class Corner(NamedTuple):
 class Mode(NamedTuple):
     """How the controller runs: predicting or not (`pid+ff`), with a fresh yaw rate or without, with whose poses, where.
 
-    `localisation` is a key of `tools.design.filter.LOCALISATIONS`. `in_bend`: with the wheels far from straight, where
-    the estimator takes a gap between measured and nominal angle for the steering's gain at once.
+    `localisation` is a key of `tools.design.filter.LOCALISATIONS`. `in_bend`: with the wheels as far from straight
+    as they go. There the estimator takes a gap between measured and nominal angle for the steering's gain at once, and
+    a radian turns the car by more than on the straight.
     """
 
     predicts: bool = True
@@ -112,6 +114,7 @@ def nominal_of(vehicle: Vehicle) -> Nominal:
         vehicle.steering_lag_s,
         round(vehicle.pose_latency_samples),
         round(vehicle.command_latency_samples),
+        vehicle.max_road_wheel_angle_rad,
     )
 
 
@@ -278,11 +281,17 @@ class _Cycle:
         self.speed_mps = row.speed_mps
         table = GainTable((row.speed_mps, row.speed_mps + 1.0), 1, ((row[2:], row[2:]),) * 2)
         self.gains = gains_at(table, 0, row.speed_mps)
+        self.filter = filter_of(row, mode)
         if mode.in_bend:
             # At a large angle a change of the learnt gain moves the command as one of the offset does; of the gap it
-            # takes this share at most.
-            self.gains = self.gains._replace(offset=self.gains.offset + self.gains.gain)
-        self.filter = filter_of(row, mode)
+            # takes this share at most. What a radian turns the car by there is 1 / cos^2 of that on the straight: the
+            # feedback divides by it, but what turns the car is learnt from as much more.
+            slope = 1.0 / math.cos(nominal.max_road_wheel_angle_rad) ** 2
+            gains = self.gains
+            self.gains = gains._replace(offset=gains.offset + gains.gain, dr=slope * gains.dr)
+            if not mode.with_yaw_rate:
+                known = self.filter.gains
+                self.filter = self.filter._replace(gains=known._replace(xe=slope * known.xe, xp=slope * known.xp))
         self.memory = nominal.pose_latency_samples if mode.predicts else 0
         self.sent = nominal.command_latency_samples + 2
         self.size = 10 + 2 * self.memory + self.sent + 1

@@ -9,7 +9,7 @@ import numpy as np
 from tools.design.certificate import Certificate
 from tools.design.optimise import CHOSEN, max_road_wheel_slope
 from tools.design.speed_profile import road_wheel_slope
-from tools.design.tables import MAX_SPEED_MPS, DesignReport, speed_limits
+from tools.design.tables import MAX_SPEED_MPS, DesignReport, gains_at_top_speed, speed_limits
 
 
 def margins_over_speed(certificate: Certificate) -> list[dict[str, Any]]:
@@ -29,6 +29,9 @@ def draw(report: DesignReport, certificate: Certificate, file: Path) -> None:
     vehicle, design = report.vehicle, report.design
     path, limits = design.path, speed_limits(vehicle)
     slope = road_wheel_slope(path, vehicle.wheelbase_m)
+    gains = gains_at_top_speed(report)
+    in_bends = [figures for name, figures in certificate.others.items() if "in a bend" in name and "yaw" not in name]
+    disk, delay = (min(of[name] for of in in_bends) for name in ("min_disk_margin", "min_delay_margin_samples"))
     facts = [
         f"path length            {path.length_m:.2f} m",
         f"clearance, with mirrors {design.clearance_m:.3f} m ({design.nearest_cone})",
@@ -44,7 +47,9 @@ def draw(report: DesignReport, certificate: Certificate, file: Path) -> None:
         f"gain, phase margin     {certificate.min_gain_margin:.2f}, "
         f"{math.degrees(certificate.min_phase_margin_rad):.0f} deg",
         f"poles in the D-region  {'all' if certificate.all_d_stable else 'NOT ALL'}",
-        "worst car, law and speed:",
+        f"disk, delay in a bend  {disk:.2f}, {delay:.1f} samples",
+        f"steering's gain        learnt by {gains['steering_gain_rate_1pm']:.2g} of a gap per m",
+        "worst car and speed:",
         *(f"  {part}" for part in certificate.worst.split(", ")),
     ]
     design_sheet(

@@ -14,14 +14,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from firmware_py.table_file import FORMAT
 from sim.data_files import Course, Vehicle, load_course, load_vehicle
 from sim.errors import UserError
 from tools.design.gains import COLUMNS as GAINS_COLUMNS
-from tools.design.gains import design_gains
+from tools.design.gains import checked_speeds, design_gains
+from tools.design.model import PERIOD_S, Row
 from tools.design.optimise import PathDesign, max_road_wheel_slope, optimise_path
 from tools.design.speed_profile import GRAVITY_MPS2, SpeedLimits, SpeedProfile, plan_speed, road_wheel_slope
 
-FORMAT = 2
 ROOT = Path(__file__).resolve().parent.parent.parent
 DBC_FOLDER = ROOT / "dbc"
 SHIPPED_FOLDER = ROOT / "firmware_py" / "tables"
@@ -40,6 +41,7 @@ SOURCES = (
     "speed_profile",
     "filter",
     "model",
+    "margins",
     "gains",
     "tables",
 )
@@ -329,6 +331,19 @@ def _nearly_equal(new: str, old: str, relative: float) -> bool:
     return all(abs(a - b) <= relative * max(abs(a), abs(b)) + LEAST_DIFFERENCE for a, b in pairs)
 
 
+def gains_at_top_speed(report: DesignReport) -> dict[str, float]:
+    """Return the PID of the law `car` forward at the car's top speed, and how fast it learns the steering's gain."""
+    speed_mps = checked_speeds(report.vehicle)[-1]
+    row = next(row for row in map(Row._make, report.gains["car"]) if row[:2] == (1.0, speed_mps))
+    return {
+        "speed_mps": speed_mps,
+        "kp_1pm2": row.kp,
+        "ki_1pm3": row.ki,
+        "kd_1pm": row.kd,
+        "steering_gain_rate_1pm": row.l_g / (speed_mps * PERIOD_S),
+    }
+
+
 def as_json(report: DesignReport, certificate: Any) -> dict[str, Any]:
     """Return the figures of a design for `--json`; `certificate` is that of tools.design.certificate, or None."""
     path = report.design.path
@@ -352,6 +367,7 @@ def as_json(report: DesignReport, certificate: Any) -> dict[str, Any]:
             "constraint_residual": report.design.fit.constraint_residual,
         },
     }
+    figures["gains"] = gains_at_top_speed(report)
     if certificate is not None:
         figures["certificate"] = certificate._asdict()
     return figures
