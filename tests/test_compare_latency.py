@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from dataclasses import replace
 
 import pytest
 from compare_support import driver, numbers_of
+from rich.console import Console
 
 from sim.data_files import load_scenario, load_vehicle
 from sim.data_files.vehicle import Criteria
@@ -21,8 +24,9 @@ from tools.compare.latency import (
     most_samples,
     with_latency,
 )
+from tools.compare.rows import Both
 from tools.compare.runs import CONTROLLERS, Driver, LegFigures, RunFigures
-from tools.compare.table import samples_cell
+from tools.compare.table import print_tables, samples_cell
 from tools.compare.verdicts import Verdict, line_of, verdicts
 
 SEEDS = range(2_000_000, 2_000_000 + RUNS)
@@ -148,3 +152,25 @@ def test_without_a_latency_or_another_law_nothing_is_claimed_of_it() -> None:
 
 def test_the_table_tells_none_and_the_most_that_is_tried() -> None:
     assert [samples_cell(samples, 24) for samples in (None, 0, 23, 24)] == ["-", "0", "23", "24+"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_no_figure_of_the_tables_is_cut_short(width: int) -> None:
+    names = ["pure-pursuit", "stanley", "car"]
+    scenarios = ["ideal", "quantised", "car-quiet", "car", "car-unknown-lag", "car-drift"]
+    both = {
+        (scenario, name, inputs): Both(2.211 + place, 0.0, 0.5621 + place, 0.0, 0.0, place)
+        for scenario in scenarios
+        for place, name in enumerate(names)
+        for inputs in ("raw", "estimator")
+    }
+    ticks = {(name, inputs): 93.0 for name in names for inputs in ("raw", "estimator")}
+    borne = Borne(dict.fromkeys(ticks, 18), MOST_SAMPLES, ASKED)
+    file = io.StringIO()
+    print_tables(Console(file=file, width=width), {name: name for name in scenarios}, both, ticks, borne)
+    shown = file.getvalue()
+    assert max(map(len, shown.splitlines())) <= width
+    for figure in ("2211", "562", "3211", "1562*", "4211", "2562*"):
+        found = re.findall(rf"(?<![\d.]){re.escape(figure)}(?![\d.])", shown)
+        assert len(found) == 2 * len(scenarios), figure
+    assert len(re.findall(r"(?<![\d.])18(?![\d.])", shown)) == 2 * len(names)

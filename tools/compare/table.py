@@ -12,6 +12,9 @@ from tools.compare.rows import Both
 if TYPE_CHECKING:
     from rich.console import Console
 
+WIDE = 100
+"""Columns of a terminal from which on a maximum and its rms stand side by side; else one above the other."""
+
 
 def print_tables(
     console: Console,
@@ -25,6 +28,7 @@ def print_tables(
     `titles` are those of the columns by scenario; `both` is by scenario, controller and inputs, `ticks` by the latter
     two, in the order of the lines.
     """
+    between = "/" if console.width >= WIDE else "\n"
     for inputs in dict.fromkeys(inputs for _, inputs in ticks):
         of = "raw inputs" if inputs == "raw" else "behind the same estimator"
         table = Table(title=f"{of}: cross-track max / rms in mm", title_justify="left", padding=(0, 0))
@@ -37,7 +41,7 @@ def print_tables(
         for name in [name for name, given in ticks if given == inputs]:
             cells = []
             for scenario in titles:
-                cells.append(_cell(both[scenario, name, inputs]))
+                cells.append(_cell(both[scenario, name, inputs], between))
                 if borne is not None and scenario == SCENARIO:
                     cells.append(samples_cell(borne.samples[name, inputs], borne.most_samples))
             style = "bold" if name == "car" else None
@@ -60,8 +64,8 @@ def samples_cell(samples: int | None, most: int) -> str:
     return f"{samples}+" if samples == most else f"{samples}"
 
 
-def _cell(figures: Both) -> str:
-    return f"{_millimetres(figures.max_m)}/{_millimetres(figures.rms_m)}{'*' if figures.stopped else ''}"
+def _cell(figures: Both, between: str) -> str:
+    return f"{_millimetres(figures.max_m)}{between}{_millimetres(figures.rms_m)}{'*' if figures.stopped else ''}"
 
 
 def _millimetres(error_m: float) -> str:
