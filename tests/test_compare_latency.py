@@ -169,6 +169,7 @@ def test_no_figure_of_the_tables_is_cut_short(width: int) -> None:
     file = io.StringIO()
     print_tables(Console(file=file, width=width), {name: name for name in scenarios}, both, ticks, borne)
     shown = file.getvalue()
+    assert "…" not in shown
     assert max(map(len, shown.splitlines())) <= width
     for figure in ("2211", "562", "3211", "1562*", "4211", "2562*"):
         found = re.findall(rf"(?<![\d.]){re.escape(figure)}(?![\d.])", shown)

@@ -34,7 +34,7 @@ def print_tables(
         table = Table(title=f"{of}: cross-track max / rms in mm", title_justify="left", padding=(0, 0))
         table.add_column("", no_wrap=True)
         for scenario, title in titles.items():
-            table.add_column(title, justify="right")
+            table.add_column(title, justify="right", overflow="fold")
             if borne is not None and scenario == SCENARIO:
                 table.add_column("latency", justify="right", no_wrap=True)
         table.add_column("us", justify="right", no_wrap=True)
