@@ -68,6 +68,8 @@ def test_a_campaign_from_end_to_end(whole: tuple[Path, dict[str, Any], str]) -> 
     assert figures["quantiles"]["min_clearance_m"]["p50"] == np.median(clearance)
     assert not file.with_name("c.parquet.journal").exists()
     assert "cones touched 0" in said
+    assert "final cross-track, mm" in said
+    assert "…" not in said, "no figure is cut short"
 
 
 @pytest.mark.live

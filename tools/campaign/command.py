@@ -400,14 +400,14 @@ def _print(summary: Summary, about: dict[str, Any], rate: float | None, passed_s
     from rich.table import Table  # noqa: PLC0415
 
     title = f"campaign: {summary.runs} runs of {about['scenario']}, {about['vehicle']} on {about['course']}, law "
-    table = Table(title=title + about["law"], title_justify="left")
+    table = Table(title=title + about["law"], title_justify="left", padding=(0, 0))
     table.add_column("figure", no_wrap=True)
     names = list(next(iter(summary.quantiles.values())))
     for name in names:
         table.add_column({"p0": "least", "p100": "most"}.get(name, name), justify="right", no_wrap=True)
     for figure, quantiles in summary.quantiles.items():
         text, unit, scale = SHOWN[figure]
-        table.add_row(f"{text}, {unit}", *[f"{scale * quantiles[name]:.4g}" for name in names])
+        table.add_row(f"{text}, {unit}", *[f"{scale * quantiles[name]:.3g}" for name in names])
     console = Console(highlight=False)
     console.print(table)
     speed = "" if rate is None else f"; {rate:.1f} runs/s, {passed_s:.0f} s in all"
