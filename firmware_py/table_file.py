@@ -28,6 +28,8 @@ from firmware_py.errors import UserError
 from firmware_py.feedforward import slip_feedforward
 
 FORMAT = 3
+"""Of the folder's files: the next with each change of their columns."""
+
 REMEDY = "run `parkctl design --update`"
 
 PATH_COLUMNS = ("station_m", "x_m", "y_m", "yaw_rad", "curvature_1pm", "curvature_slope_1pm2")

@@ -268,6 +268,16 @@ def asking(vehicle, **demand):
     return type(vehicle)(**{**vars(vehicle), "criteria": vehicle.criteria.model_copy(update=demand)})
 
 
+def test_a_gain_that_is_learnt_too_fast_is_found_in_the_bend_alone():
+    table = [tuple(model.Row(*row)._replace(l_g=4.0 * model.Row(*row).l_g)) for row in designed()["car"]]
+    known = known_exactly(vehicle_of())
+    slower = type(known)(**{**vars(known), "box": {**known.box, "steering_lag_s": (0.2, 0.2)}})
+    found = certify(slower, {"car": table})
+    assert not found.holds
+    assert any(line.startswith("car, poses without noise, in a bend: delay margin") for line in found.lacks)
+    assert all("in a bend" in line for line in found.lacks)
+
+
 def test_a_vehicle_that_asks_for_more_delay_margin_gets_a_design_that_has_it():
     """In a bend by learning the steering's gain more slowly; beyond that by a slower PID."""
     vehicles = {n: asking(vehicle_of("pickup"), least_delay_margin_samples=n) for n in (10.0, 12.0, 15.0)}
@@ -283,9 +293,10 @@ def test_a_vehicle_that_asks_for_more_delay_margin_gets_a_design_that_has_it():
     [
         (
             {"least_disk_margin": 1.1},
-            r"no gains of law car keep a disk margin of 1\.32 and a delay margin of 12 samples",
+            r"a disk margin of 1\.32 and a delay margin of 12 samples",
         ),
         ({"least_delay_margin_samples": 80.0}, "and a delay margin of 96 samples at"),
+        ({"slowest_pole_1pm": -0.9}, r"\[design\] slowest_pole_1pm = -0\.9, least_damping = 0\.1: no gains of law car"),
     ],
 )
 def test_margins_that_no_gains_have_are_refused_in_one_line(demand, named):

@@ -9,7 +9,7 @@ import pytest
 from design_support import NOMINAL, FirmwareLaw, corner, designed, row_at, vehicle_of
 from scipy.linalg import solve_discrete_are
 
-from firmware_py.core import kalman
+from firmware_py.core import estimator, kalman
 from firmware_py.core.schedule import gains_at
 from firmware_py.core.tables import GAIN_COLUMNS, GainTable
 from firmware_py.table_file import GAINS_COLUMNS
@@ -129,6 +129,35 @@ def test_frequency_responses_are_those_of_the_matrices(law, mode):
         assert model.car_response(car, 0.5, -1.0, z) == pytest.approx(model.response(own, z)[:, :, 0], rel=1e-6)
         loop = model.loop_response(system, row, [car], z)[0]
         assert loop == pytest.approx(model.response(model.open_loop(system, own), z)[:, 0, 0], rel=1e-5)
+
+
+@pytest.mark.parametrize("with_yaw_rate", [True, False])
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_in_a_bend_the_road_is_learnt_from_what_a_radian_turns_the_car_by_there(direction, with_yaw_rate):
+    """The firmware's estimator in the bend, against the row of the model's matrix on the straight and in the bend."""
+    angle_rad, push_rad = 0.5, 1e-5
+    slope = 1.0 / math.cos(angle_rad) ** 2
+    row = row_at(designed()["car"], direction, 1.0)
+    mode = model.Mode(localisation="exact", with_yaw_rate=with_yaw_rate, in_bend=True)
+    inputs = {
+        bend_rad: model.controller(row, NOMINAL._replace(max_road_wheel_angle_rad=bend_rad), mode).b
+        for bend_rad in (0.0, angle_rad)
+    }
+    road = 2  # its place in the state
+    assert np.count_nonzero(inputs[0.0][road]) >= 2
+    assert inputs[angle_rad][road] == pytest.approx(slope * inputs[0.0][road], rel=1e-6)
+    others = [0, 1, *range(3, 10)]  # of the estimator; command and integral see the road disturbance at once
+    assert inputs[angle_rad][others] == pytest.approx(inputs[0.0][others], rel=1e-6, abs=1e-12)
+
+    def turned_rad(wheels_rad):
+        law = FirmwareLaw(row, NOMINAL, mode)
+        state = law.state._replace(road_wheel_angle_rad=wheels_rad, modelled_angle_rad=wheels_rad)
+        motion = estimator.Motion(0.01, model.PERIOD_S, wheels_rad, wheels_rad, 1, 0.0, 0, 0, 1)
+        seen = estimator.estimate(law.leg, law.car, law.gains, state, motion, 0, 0.0, 0.0, 0.0, 1, 0.0, 1)
+        return seen.yaw_rad
+
+    by_a_radian = [(turned_rad(at + push_rad) - turned_rad(at)) / push_rad for at in (0.0, angle_rad)]
+    assert by_a_radian[1] == pytest.approx(slope * by_a_radian[0], rel=1e-3)
 
 
 def test_forwards_gains_belong_to_forward():

@@ -13,6 +13,7 @@ from sim.errors import UserError
 from tools import cli
 from tools.design import finer, optimise, refusal, tables, trade
 from tools.design.certificate import Certificate
+from tools.design.gains import MODES
 from tools.design.optimise import CHOSEN, MOST_CLEARANCE, Weights, make_path, optimise_path
 from tools.design.speed_profile import plan_speed
 from tools.design.tables import SHIPPED_FOLDER, recorded_numbers, speed_limits
@@ -134,7 +135,12 @@ def test_the_sheet_is_drawn(tmp_path):
 
     report = tables.run_design(PAPER, OHIO, recorded_numbers(SHIPPED_FOLDER / "paper-ohio"))
     by_speed = [(sign, speed, 1.0 - 0.4 * speed, 20.0 / speed) for speed in (0.1, 0.5, 1.0) for sign in (1.0, -1.0)]
-    certificate = Certificate(20.0, 0.6, 3.0, 0.5, True, True, "lag 0.2 s, 1 m/s", {}, by_speed)
+    bends = {
+        name: {"min_disk_margin": 0.52, "min_delay_margin_samples": 11.0}
+        for name, mode in MODES["car"].items()
+        if mode.in_bend
+    }
+    certificate = Certificate(20.0, 0.6, 3.0, 0.5, True, True, [], "lag 0.2 s, 1 m/s", bends, by_speed)
     assert [entry["disk"] for entry in sheet.margins_over_speed(certificate)] == [pytest.approx([0.96, 0.8, 0.6])] * 2
     sheet.draw(report, certificate, tmp_path / "design.png")
     assert (tmp_path / "design.png").read_bytes().startswith(PNG)

@@ -41,7 +41,8 @@ OVER_SPEED_MPS = 0.2
 STEERING_GAP_RAD = 0.08
 STEERING_GAP_US = 300_000
 """The measured angle may differ from the nominal actuator's by what the slowest rack of the vehicle file explains, with
-the swing that it brings: 0.09 rad at most with a lag of 0.27 s where 0.1 s is known, but for less than so long."""
+the swing that it brings. With a lag of 0.27 s where 0.1 s is known it is 0.09 rad at most, and above the limit for less
+than STEERING_GAP_US."""
 
 SPEED_GAP_MPS = 0.25
 SPEED_GAP_US = 300_000

@@ -5,13 +5,14 @@ estimator's filter makes its gains itself, while it runs; margins are those with
 (`tools.design.filter`). The PID is one pattern of poles per metre (`pid_gains`), scaled by a pace. At every speed of
 the grid the pace is the largest one, up to the law's own, with which the nominal car and every corner of the vehicle's
 box keep their poles in the D-region (`d_stable`), their disk margin and their delay margin, with a reserve over what
-the vehicle's file asks for (`Demand`).
+the vehicle's file asks for (`Demand`). The rate at which the steering's gain is learnt is the largest one with which
+they do in a bend; without the yaw rate a smaller disk margin is enough, and no delay margin is asked for.
 """
 
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -261,7 +262,7 @@ def in_region(poles: Complexes, speed_mps: float, criteria: Criteria, reserve: f
 
 
 class Demand(NamedTuple):
-    """What every car of the box keeps with the chosen gains, in one mode of a law."""
+    """What every car of the box should keep with the gains of a law, in one of its modes."""
 
     disk_margin: float
     delay_margin_samples: float
@@ -380,22 +381,21 @@ class _Choice:
         return all(_survives(row, self.vehicle, mode, self.at[speed_mps], self.demands[mode]) for mode in modes)
 
     def pace_at(self, speed_mps: float) -> float:
-        """The PID's largest pace, with nothing learnt of the steering's gain; UserError where none survives."""
+        """The PID's largest pace in the law's usual mode; UserError where none survives."""
 
-        def survives(modes: list[Mode], pace: float) -> bool:
-            return self.survive(modes, speed_mps, pace, OBSERVER_PACES[0], 0.0)
+        def survives(pace: float) -> bool:
+            return self.survive([MODES[self.law][self.law]], speed_mps, pace, OBSERVER_PACES[0], 0.0)
 
-        pace: float | None = FASTEST_PACE[self.law]
-        every = [mode for mode in self.demands if mode.with_yaw_rate]
-        for modes in ([MODES[self.law][self.law]], every):  # the usual one mostly decides, and alone is found quickly
-            if pace is not None:
-                pace = _largest(partial(survives, modes), SLOWEST_PACE, pace)
+        pace = _largest(survives, SLOWEST_PACE, FASTEST_PACE[self.law])
         if pace is None:
-            raise UserError(_why_not(self.vehicle, self.law))
+            raise UserError(_why_not(self.vehicle, self.law, speed_mps))
         return pace
 
     def observer_pace(self, paces: dict[float, float]) -> float:
-        """The first of the observers without the yaw rate that survives at every speed, with the PID's pace there."""
+        """The first of the observers without the yaw rate that survives with the PID's pace at every speed.
+
+        The slowest where none does.
+        """
         modes = [mode for mode in self.demands if not mode.with_yaw_rate]
         for tried in OBSERVER_PACES:
             if all(self.survive(modes, speed_mps, pace, tried, 0.0) for speed_mps, pace in paces.items()):
@@ -403,16 +403,16 @@ class _Choice:
         return OBSERVER_PACES[-1]
 
     def gain_rate_at(self, speed_mps: float, pace: float, observer_pace: float) -> float:
-        """The largest rate at which the steering's gain may be learnt, 1/m; modes that none helps do not decide."""
+        """The largest rate at which the steering's gain may be learnt, 1/m; 0 where a bend bears none at all."""
         in_bends = [mode for mode in self.demands if mode.in_bend]
         if not in_bends:
             return 0.0
-        modes = [mode for mode in in_bends if self.survive([mode], speed_mps, pace, observer_pace, 0.0)]
-        rate_1pm = _largest(
-            lambda tried: self.survive(modes, speed_mps, pace, observer_pace, tried), 0.0, GAIN_RATE_MAX_1PM
-        )
-        assert rate_1pm is not None, "with 0 they survive"
-        return rate_1pm
+
+        def survives(rate_1pm: float) -> bool:
+            return self.survive(in_bends, speed_mps, pace, observer_pace, rate_1pm)
+
+        rate_1pm = _largest(survives, 0.0, GAIN_RATE_MAX_1PM)
+        return 0.0 if rate_1pm is None else rate_1pm
 
 
 def _survives(row: Row, vehicle: Vehicle, mode: Mode, at: CarsAtSpeed, demand: Demand) -> bool:
@@ -443,45 +443,51 @@ def _largest(holds: Callable[[float], bool], low: float, high: float, steps: int
     return low
 
 
-def _why_not(vehicle: Vehicle, law: str) -> str:
-    """One line that names the dimension of the box which keeps the softest gains from surviving."""
-    nominal = model.nominal_of(vehicle)
-    speed = checked_speeds(vehicle)[-1]
-    row = row_of(law, 1.0, speed, SLOWEST_PACE, OBSERVER_PACES[-1], 0.0)
-    omega = frequencies(speed)
-    modes = [mode for mode in MODES[law].values() if mode.with_yaw_rate]
-    systems = [(model.controller(row, nominal, mode), demand_of(vehicle, law, mode)) for mode in modes]
+def _why_not(vehicle: Vehicle, law: str, speed_mps: float) -> str:
+    """One line that names what keeps the softest gains from surviving: the region itself, or a dimension of the box."""
+    mode = MODES[law][law]
+    demand = demand_of(vehicle, law, mode)
+    row = row_of(law, 1.0, speed_mps, SLOWEST_PACE, OBSERVER_PACES[0], 0.0)
+    omega = frequencies(speed_mps)
+    system = model.controller(row, model.nominal_of(vehicle), mode)
 
     def share(car: model.Corner) -> float:
-        """Of what is asked for in margins, the least share that a car keeps."""
-        kept = math.inf
-        for system, demand in systems:
-            if not d_stable(model.closed_loop(system, model.car(car, speed, 1.0)), speed, demand.region):
-                return 0.0
-            found = margins_of(model.loop_response(system, row, [car], on_circle(omega))[0], omega)
-            kept = min(kept, found.disk / demand.disk_margin)
-            if demand.delay_margin_samples > 0.0:
-                kept = min(kept, found.delay_samples / demand.delay_margin_samples)
+        """The least share that a car keeps of the margins asked for; 0 with poles outside the region."""
+        matrix = model.closed_loop(system, model.car(car, speed_mps, 1.0))
+        if not d_stable(matrix, speed_mps, demand.region, demand.damping_reserve):
+            return 0.0
+        found = margins_of(model.loop_response(system, row, [car], on_circle(omega))[0], omega)
+        kept = found.disk / demand.disk_margin
+        if demand.delay_margin_samples > 0.0:
+            kept = min(kept, found.delay_samples / demand.delay_margin_samples)
         return kept
 
     cars = corners(vehicle, softest_tyres=True)
+    at = f"at {speed_mps:g} m/s"
+    if share(cars[0]) == 0.0:
+        region = (
+            f"slowest_pole_1pm = {demand.region.slowest_pole_1pm:g}, least_damping = {demand.region.least_damping:g}"
+        )
+        return (
+            f"vehicle {vehicle.name}: [design] {region}: no gains of law {law} keep the nominal car's poles there {at}"
+        )
     worst = min(cars, key=share)
     # The dimension that helps most when it alone is nominal; where none helps enough, when it alone does not delay.
     blamed = _dimension_that_helps(worst, cars[0], share)
     if blamed[0] < 1.0:
         ideal = cars[0]._replace(steering_lag_s=0.0, pose_latency_samples=0, command_latency_samples=0.0)
         blamed = _dimension_that_helps(worst, ideal, share)
-    usual = demand_of(vehicle, law, MODES[law][law])
-    asked = f"a disk margin of {usual.disk_margin:g}"
-    if usual.delay_margin_samples > 0.0:
-        asked += f" and a delay margin of {usual.delay_margin_samples:g} samples"
+    asked = f"the poles in the D-region and a disk margin of {demand.disk_margin:g}"
+    if demand.delay_margin_samples > 0.0:
+        asked = f"the poles in the D-region, a disk margin of {demand.disk_margin:g} and a delay margin of"
+        asked += f" {demand.delay_margin_samples:g} samples"
     keys = blamed[1]
     own, low, high = (
         sum(values) for values in zip(*((getattr(vehicle, key), *vehicle.box[key]) for key in keys), strict=True)
     )
     return (
         f"vehicle {vehicle.name}: {' + '.join(keys)} = {own:g} ({low:g} to {high:g}): no gains of law {law} keep"
-        f" {asked} at {speed:g} m/s with {worst.name}; narrow low..high, or a quicker car"
+        f" {asked} {at} with {worst.name}; narrow low..high, or a quicker car"
     )
 
 

@@ -1,9 +1,10 @@
 """The sampled steering loop as matrices: the car, the controller as the firmware runs it, and the loop they close.
 
-Everything is linear about a straight path at a constant speed. The controller's matrices are those of the firmware's
-own functions (`firmware_py.core`: estimator, predictor, PID, disturbances), taken by differences, so that observer,
-predictor and remembered commands are in them as they run; limits are not reached. The car is a single-track model with
-linear tyres behind a lagging steering with dead time, sampled exactly.
+Everything is linear about a straight path at a constant speed; of a bend that is put in which changes the loop there.
+The controller's matrices are those of the firmware's own functions (`firmware_py.core`: estimator, predictor, PID,
+disturbances), taken by differences, so that observer, predictor and remembered commands are in them as they run; limits
+are not reached. The car is a single-track model with linear tyres behind a lagging steering with dead time, sampled
+exactly.
 
 Where the loop is cut for the margins is the steering command on its way to the car: what the controller remembers as
 sent stays inside the controller. A cycle begins with the vehicle's reports; the pose in them is older by its latency,
@@ -285,7 +286,8 @@ class _Cycle:
         if mode.in_bend:
             # At a large angle a change of the learnt gain moves the command as one of the offset does; of the gap it
             # takes this share at most. What a radian turns the car by there is 1 / cos^2 of that on the straight: the
-            # feedback divides by it, but what turns the car is learnt from as much more.
+            # feedback divides by it, but what turns the car is learnt from as much more. That counts where poses teach
+            # it; by the yaw rate it is learnt at once either way.
             slope = 1.0 / math.cos(nominal.max_road_wheel_angle_rad) ** 2
             gains = self.gains
             self.gains = gains._replace(offset=gains.offset + gains.gain, dr=slope * gains.dr)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tools.design.certificate import Certificate
+from tools.design.gains import MODES
 from tools.design.optimise import CHOSEN, max_road_wheel_slope
 from tools.design.speed_profile import road_wheel_slope
 from tools.design.tables import MAX_SPEED_MPS, DesignReport, gains_at_top_speed, speed_limits
@@ -30,7 +31,7 @@ def draw(report: DesignReport, certificate: Certificate, file: Path) -> None:
     path, limits = design.path, speed_limits(vehicle)
     slope = road_wheel_slope(path, vehicle.wheelbase_m)
     gains = gains_at_top_speed(report)
-    in_bends = [figures for name, figures in certificate.others.items() if "in a bend" in name and "yaw" not in name]
+    in_bends = [certificate.others[name] for name, mode in MODES["car"].items() if mode.in_bend and mode.with_yaw_rate]
     disk, delay = (min(of[name] for of in in_bends) for name in ("min_disk_margin", "min_delay_margin_samples"))
     facts = [
         f"path length            {path.length_m:.2f} m",
