@@ -17,6 +17,7 @@ from sim import vehicle as plant
 from sim.errors import UserError
 from tools.design import gains as design
 from tools.design import model
+from tools.design.box import corners
 from tools.design.filter import HEADING_NOISE_RAD, POSITION_NOISE_M, settled
 from tools.design.margins import disk_margin, frequencies, on_circle
 
@@ -309,7 +310,7 @@ def test_each_column_of_a_table_comes_to_the_gain_of_its_name():
 
 def test_the_choice_is_the_fastest_that_keeps_the_margin_and_the_next_faster_does_not():
     vehicle = vehicle_of("paper", "slow-rack")
-    nominal, cars = model.nominal_of(vehicle), design.corners(vehicle, softest_tyres=True)
+    nominal, cars = model.nominal_of(vehicle), corners(vehicle, softest_tyres=True)
     row = row_at(designed("paper", "slow-rack")["car"], 1.0, 1.0)
     pace = math.sqrt(row.kp / 3.0)
     assert design.SLOWEST_PACE < pace < design.FASTEST_PACE["car"], "the margins decide here, not the ends"

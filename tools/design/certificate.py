@@ -1,7 +1,7 @@
 """The certificate of a set of gains: stability margins of the whole steering loop over every car that may come true.
 
 Every direction, speed of the gain table and middle between two speeds, each with the nominal car and all corners of the
-vehicle's box (`tools.design.gains.corners`). Margins are those of the loop cut at the steering command.
+vehicle's box (`tools.design.box`). Margins are those of the loop cut at the steering command.
 """
 
 from itertools import pairwise
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from sim.data_files import Vehicle
 from tools.design import gains as criteria
 from tools.design import model
+from tools.design.box import CarsAtSpeed, cars_at_speed, corners
 from tools.design.margins import UNSTABLE, Margins, frequencies, margins_of, on_circle
 from tools.design.model import Floats, Row
 
@@ -45,13 +46,13 @@ class Certificate(NamedTuple):
 
 def certify(vehicle: Vehicle, gains: dict[str, list[tuple[float, ...]]]) -> Certificate:
     """Certify gain tables (`tools.design.gains.design_gains`) for a vehicle."""
-    cars = criteria.corners(vehicle)
+    cars = corners(vehicle)
     top_mps = criteria.checked_speeds(vehicle)[-1]
     found: dict[str, list[_Found]] = {}
     tables = {law: _rows(rows, top_mps) for law, rows in gains.items()}
     for index, first in enumerate(tables["car"]):
         omega = frequencies(first.speed_mps, RESOLUTION)
-        at = criteria.cars_at_speed(cars, first.speed_mps, first.direction, on_circle(omega))
+        at = cars_at_speed(cars, first.speed_mps, first.direction, on_circle(omega))
         for law, rows in tables.items():
             for name, mode in criteria.MODES[law].items():
                 found.setdefault(name, []).append(_found(rows[index], vehicle, mode, at, omega))
@@ -76,7 +77,7 @@ class _Found(NamedTuple):
     worst_car: str
 
 
-def _found(row: Row, vehicle: Vehicle, mode: model.Mode, at: criteria.CarsAtSpeed, omega: Floats) -> _Found:
+def _found(row: Row, vehicle: Vehicle, mode: model.Mode, at: CarsAtSpeed, omega: Floats) -> _Found:
     law = model.controller(row, model.nominal_of(vehicle), mode)
     all_margins = []
     d_stable = True

@@ -9,9 +9,8 @@ the vehicle's file asks for (`Demand`). The rate at which the steering's gain is
 they do in a bend; without the yaw rate a smaller disk margin is enough, and no delay margin is asked for.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import NamedTuple
 
@@ -23,6 +22,7 @@ from firmware_py.core.motion import QUEUE_LENGTH
 from sim.data_files import Criteria, Vehicle
 from sim.errors import UserError
 from tools.design import model
+from tools.design.box import CarsAtSpeed, cars_at_speed, corners
 from tools.design.margins import disk_margin, frequencies, margins_of, on_circle
 from tools.design.model import Complexes, Floats, Mode, Row
 
@@ -94,9 +94,8 @@ RESERVE = 1.2
 """What the usual loop keeps over what the vehicle's file asks for, in margins and damping: what is blended between two
 rows has a little less than they, and a finer grid of frequencies finds a little less."""
 
-RESERVE_OF_OTHERS = 1.05
-"""The same with less usual poses and in a bend: nothing is built upon those, and the learnt gain may have all the
-margin that the PID leaves there."""
+BEND_RESERVE = 1.05
+"""The same in a bend, for what the grids miss: the learnt gain may have nearly all the margin that the PID leaves."""
 
 LEAST_DISK_MARGIN_OF_PLAIN = 0.34
 """Of the law `pid_ff`, which is there to compare with: 1.4 times the steering gain or 19 degrees of phase."""
@@ -106,9 +105,6 @@ LEAST_DISK_MARGIN_WITHOUT_YAW_RATE = 0.34
 
 QUICK_1PS = 10.0
 """Poles that decay faster, within 0.1 s, belong to delay chain and lag and need no damping."""
-
-GAIN_SPREAD = 0.1
-"""Steering gain of the cars in the box."""
 
 
 def pid_gains(law: str, pace: float) -> tuple[float, float, float]:
@@ -135,67 +131,6 @@ def checked_speeds(vehicle: Vehicle) -> tuple[float, ...]:
     """Speeds of the grid that the car can have, without standstill; in the rows beyond, it never is."""
     reached = [speed for speed in SPEED_GRID_MPS[:-1] if speed < vehicle.max_speed_mps]
     return SPEED_GRID_MPS[1 : len(reached) + 1]
-
-
-def corners(vehicle: Vehicle, softest_tyres: bool = False) -> list[model.Corner]:
-    """The cars to survive: the nominal one, then the corners of the box.
-
-    In steering lag, latencies, steering gain, wheelbase, mass (with the yaw inertia) and cornering stiffness (both
-    axles together). With `softest_tyres` only those with the greatest mass on the softest tyres, which answer last.
-    """
-    nominal = model.Corner(
-        "nominal car",
-        vehicle.steering_lag_s,
-        round(vehicle.pose_latency_samples),
-        vehicle.command_latency_samples,
-        1.0,
-        vehicle.wheelbase_m,
-        vehicle.cg_to_rear_axle_m,
-        vehicle.mass_kg,
-        vehicle.yaw_inertia_kgm2,
-        vehicle.cornering_stiffness_front_n_per_rad,
-        vehicle.cornering_stiffness_rear_n_per_rad,
-    )
-    cars = [nominal]
-    box = vehicle.box
-
-    def shares(key: str, softest: int) -> tuple[float, ...]:
-        both = tuple(end / getattr(vehicle, key) for end in _ends(box[key]))
-        return both[softest : softest + 1] or both if softest_tyres else both
-
-    for lag, pose, command, gain, wheelbase, mass, stiffness in itertools.product(
-        _ends(box["steering_lag_s"]),
-        _ends(box["pose_latency_samples"]),
-        _ends(box["command_latency_samples"]),
-        (1.0 - GAIN_SPREAD, 1.0 + GAIN_SPREAD),
-        _ends(box["wheelbase_m"]),
-        shares("mass_kg", 1),
-        shares("cornering_stiffness_front_n_per_rad", 0),
-    ):
-        name = (
-            f"lag {lag:g} s, latency {pose:g} + {command:g} samples, steering gain {gain:g}, wheelbase {wheelbase:g} m,"
-            f" mass {mass:.2g} and stiffness {stiffness:.2g} of nominal"
-        )
-        cars.append(
-            nominal._replace(
-                name=name,
-                steering_lag_s=lag,
-                pose_latency_samples=math.ceil(pose - 1e-9),
-                command_latency_samples=command,
-                steering_gain=gain,
-                wheelbase_m=wheelbase,
-                cg_to_rear_axle_m=nominal.cg_to_rear_axle_m * wheelbase / vehicle.wheelbase_m,
-                mass_kg=nominal.mass_kg * mass,
-                yaw_inertia_kgm2=nominal.yaw_inertia_kgm2 * mass,
-                stiffness_front_n_per_rad=nominal.stiffness_front_n_per_rad * stiffness,
-                stiffness_rear_n_per_rad=nominal.stiffness_rear_n_per_rad * stiffness,
-            )
-        )
-    return cars
-
-
-def _ends(interval: tuple[float, float]) -> tuple[float, ...]:
-    return interval[:1] if interval[0] == interval[1] else interval
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -278,7 +213,7 @@ def region_of(criteria: Criteria, mode: Mode) -> Criteria:
 def demand_of(vehicle: Vehicle, law: str, mode: Mode) -> Demand:
     """What a vehicle's file asks of a law's mode, with its reserve."""
     criteria = vehicle.criteria
-    reserve = RESERVE if mode.localisation == "white" and not mode.in_bend else RESERVE_OF_OTHERS
+    reserve = BEND_RESERVE if mode.in_bend else RESERVE
     disk_margin, delay_samples = reserve * criteria.least_disk_margin, reserve * criteria.least_delay_margin_samples
     if law != "car":
         disk_margin, delay_samples = LEAST_DISK_MARGIN_OF_PLAIN, 0.0
@@ -323,25 +258,6 @@ def design_gains(vehicle: Vehicle) -> dict[str, list[tuple[float, ...]]]:
             for speed, pace, rate_1pm in zip(SPEED_GRID_MPS, schedule.pid_pace, schedule.gain_rate_1pm, strict=True)
         ]
     return tables
-
-
-class CarsAtSpeed(NamedTuple):
-    """The cars of a vehicle's box at one speed: their answers at the points z, and their matrices."""
-
-    cars: Sequence[model.Corner]
-    z: Complexes
-    answers: Complexes
-    plants: Sequence[model.StateSpace]
-
-
-def cars_at_speed(cars: Sequence[model.Corner], speed_mps: float, direction: float, z: Complexes) -> CarsAtSpeed:
-    """Return the cars at a speed and direction; what all laws and modes have in common."""
-    return CarsAtSpeed(
-        cars,
-        z,
-        np.stack([model.car_response(car, speed_mps, direction, z) for car in cars]),
-        [model.car(car, speed_mps, direction) for car in cars],
-    )
 
 
 def choose(vehicle: Vehicle, law: str) -> Schedule:

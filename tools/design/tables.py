@@ -41,6 +41,7 @@ SOURCES = (
     "speed_profile",
     "filter",
     "model",
+    "box",
     "margins",
     "gains",
     "tables",
